@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -24,6 +25,7 @@ from skipgs_plug.core.trainer_info import TrainerInfo
 from skipgs_plug.host_copy import HostCopy
 
 MODULE, RUNNER, LOOP = "gsplat.distributed", "Runner", "train"
+START = f"call of {MODULE}.cli()"  # by it the script starts the function that trains
 EXPECTED = ("cfg", "parser", "trainset", "rasterize_splats", "world_size")
 BATCH = "batch"  # one key for the joint loss of random batches: a batch never comes up twice
 
@@ -67,17 +69,25 @@ class GsplatRunner(AbstractAdapter):
         def started(
             original: Callable[..., Any], rank: int, size: int, fn: Callable[..., Any], *args: Any, **kwargs: Any
         ) -> Any:
-            names = getattr(fn, "__globals__", {})  # a functools.partial has none
-            if RUNNER not in names:
-                raise self.mismatch(f"a class {RUNNER} among the names of the function that the script passes to cli()")
-            self.attach_on_call(hooks, names[RUNNER], LOOP)
+            if START in hooks.awaited:  # a second training run finds its Runner attached to, which releases the gate
+                hooks.awaited.discard(START)
+                names = getattr(fn, "__globals__", {})  # a functools.partial has none
+                if RUNNER not in names:
+                    expected = f"a class {RUNNER} among the names of the function that the script passes to cli()"
+                    raise self.mismatch(expected)
+                self.attach_on_call(hooks, names[RUNNER], LOOP)
             return original(rank, size, fn, *args, **kwargs)
 
         # Only the launcher attaches in each spawned process.
         if not getattr(torch.multiprocessing.spawn, GATES_SPAWNED, False):
             refuse_other_processes(hooks)
         hooks.gate_tensor_backward(LOOP)
-        when_imported(hooks, MODULE, lambda module: hooks.wrap(module, "_distributed_worker", started))
+
+        def imported(module: ModuleType) -> None:
+            hooks.awaited.add(START)
+            hooks.wrap(module, "_distributed_worker", started)
+
+        when_imported(hooks, MODULE, imported)
 
     def attach(self, hooks: Hooks) -> None:
         runner = self.trainer

@@ -63,6 +63,8 @@ REPLACED: dict[str, Any] = {
     # Scripts assert that a device is available, and count devices to start one process for each.
     "torch.cuda.is_available": lambda: True,
     "torch.cuda.device_count": lambda: 1,
+    # `torch.autocast("cuda", torch.bfloat16)` asks this; on the CPU, it changes nothing.
+    "torch.cuda.is_bf16_supported": lambda including_emulation=True: True,
     # Torch's optimizers call this when a device is available. A build with CUDA raises an error without a driver.
     "torch.cuda.is_current_stream_capturing": lambda: False,
     "torch.cuda.FloatTensor": torch.FloatTensor,

@@ -124,9 +124,9 @@ def _resolve(command: Sequence[str]) -> _Program:
         run = functools.partial(_run_path, str(script))
         return _Program([str(script), *arguments], script.parent, script, run)
     if (installed := _provided(script.name if script.is_file() else name)) is not None:
-        command = commands / installed.name
-        source = _source_of(installed.module) or command
-        return _Program([str(command), *arguments], commands, source, functools.partial(_call, installed))
+        file = commands / installed.name
+        module = _source_of(installed.module) or file
+        return _Program([str(file), *arguments], commands, module, functools.partial(_call, installed))
     if script.is_dir():
         raise SkipGSError(f"{script} is a folder: name the training script in it after '--'.")
     raise SkipGSError(f"There is no script {script}: name the training script after '--'.")

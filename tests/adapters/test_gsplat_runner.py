@@ -137,6 +137,22 @@ def test_a_runner_of_a_derived_class_with_all_of_its_own_is_reached(gsplat_modul
     assert not any(hasattr(kind.__init__, "__skipgs_plug__") for kind in (parent, own))
 
 
+def test_a_script_that_starts_its_function_itself_is_refused_with_its_first_backward(gsplat_module):
+    new_log()
+    names = {"Runner": type("Runner", (Runner,), {}), "DefaultStrategy": DefaultStrategy}
+    sentence = r"trains without a call of gsplat\.distributed\.cli\(\)"
+    with pytest.raises(AdapterMismatchError, match=sentence), SkipGate(adapter="gsplat"):
+        exec("Runner(DefaultStrategy()).train()", names)
+
+
+def test_a_second_start_releases_the_gate_with_one_sentence(gsplat_module):
+    new_log()
+    second = pytest.warns(RuntimeWarning, match="a second training run begins in this process")
+    with second as said, SkipGate(adapter="gsplat", **RULE) as gate:
+        gsplat_module.cli(script()["main"], None)
+    assert len(said) == 1 and gate.report()["iterations"] == 60
+
+
 def test_a_script_that_trains_without_the_launcher_is_refused_with_its_first_backward(monkeypatch):
     """As gsplat's own scripts before 1.2 and simple_trainer_2dgs.py do, if a user names the adapter for them."""
     monkeypatch.delitem(sys.modules, "gsplat.distributed", raising=False)

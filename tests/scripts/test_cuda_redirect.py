@@ -179,3 +179,10 @@ def test_everything_is_back_afterwards(fails):
     if not torch.cuda.is_available():
         with pytest.raises((AssertionError, RuntimeError)):
             torch.ones(1).cuda()
+
+
+def test_autocast_for_cuda_changes_nothing():
+    """In bfloat16 too, for which torch asks the device."""
+    ones = torch.ones(2, 2)
+    with cuda_on_cpu(), torch.autocast("cuda", torch.bfloat16):
+        assert (ones @ ones).dtype == torch.float32
