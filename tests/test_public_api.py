@@ -177,6 +177,7 @@ def test_what_adapters_are_written_with() -> None:
         "with_share",
         "saved_state",
         "output_folder",
+        "script",
         "replaced",
         "stand_ins",
     }
