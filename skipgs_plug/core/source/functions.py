@@ -138,7 +138,7 @@ def undecorated(function: Any) -> FunctionType | None:
         return None
     function = inspect.unwrap(function)
     if not isinstance(function, FunctionType):
-        return None
+        return undecorated(function) if isinstance(function, MethodType) else None  # a gate wraps bound methods
     for held in closure(function).values():
         if isinstance(held, FunctionType) and held.__name__ == function.__name__ and held is not function:
             return undecorated(held)
