@@ -10,7 +10,7 @@ import torch
 
 from skipgs_plug.adapters.base import GATES_SPAWNED, AbstractAdapter, refuse_other_processes
 from skipgs_plug.adapters.gsplat_strategy import (
-    gradients_read_until,
+    first_iterations,
     iterations_that_run,
     leave_out_noise,
     strategy_events,
@@ -131,14 +131,15 @@ class GsplatRunner(AbstractAdapter):
         self._relocations = leave_out_noise(hooks, strategy, type(strategy))
         self.output_folder = runner.cfg.result_dir
         last = runner.cfg.max_steps - 1
+        start, read_until = first_iterations(survey, strategy, last)
         hooks.ready(
             TrainerInfo(
-                survey.start_after_changes(strategy.refine_stop_iter, last),
+                start,
                 view_names=names,
                 epoch=-(-len(runner.trainset) // runner.cfg.batch_size),
                 max_steps=last,
                 world_size=runner.world_size,
-                gradients_read_until=gradients_read_until(strategy),
+                gradients_read_until=read_until,
                 densification=None if survey.unknown else strategy_events(strategy),
                 photographs=None if survey.unknown else show_half_size_batches(hooks, runner),
             )

@@ -28,8 +28,8 @@ CHANGES = (
     "split",
 )
 # Further methods of a strategy, and functions, that change no parameters: noise is left out with the gradient step.
-KNOWN = ("_update_state", "check_sanity", "initialize_state", "inject_noise_to_position")
-STAGES = ("step_pre_backward", "step_post_backward")
+KNOWN = ("check_sanity", "initialize_state", "inject_noise_to_position")
+STAGES = ("step_pre_backward", "step_post_backward", "_update_state")
 
 
 def survey_of(adapter: Adapter, strategy: Any, *owners: Any, through: Iterable[str] = ()) -> Survey:
@@ -43,19 +43,39 @@ def is_mcmc(strategy: Any) -> bool:
     return hasattr(strategy, "noise_lr")
 
 
-def gradients_read_until(strategy: Any) -> int | None:
-    """Return the first iteration whose gradients the strategy does not read; None if it never reads gradients."""
-    return None if strategy is None or is_mcmc(strategy) else int(strategy.refine_stop_iter)
+def first_iterations(survey: Survey, strategy: Any, last: int) -> tuple[int | None, int | None]:
+    """Return the first iteration that the gate may skip, and the first one whose gradients nothing reads.
+
+    Strategies of others, and models that densify by themselves (nerfstudio before 1.1.5), may have no
+    `refine_stop_iter`, or read gradients for longer.
+
+    Args:
+        survey: The survey, which has read the trainer.
+        strategy: The strategy; None if the model densifies by itself.
+        last: Last iteration of the run.
+
+    Returns:
+        Both, None if not known. The second is None, too, if gradients are never read.
+
+    Raises:
+        AdapterMismatchError: Gradients are read until the end of the run, or the end of densification moves.
+    """
+    stop = getattr(strategy, "refine_stop_iter", None)
+    read_until = survey.end_of_gradients(last if stop is None else max(last, stop))
+    if stop is not None and not is_mcmc(strategy):
+        read_until = max(int(stop), read_until or 0)
+    start = read_until if stop is None else int(stop)
+    return (None if start is None else survey.start_after_changes(start, last)), read_until
 
 
 def strategy_events(strategy: Any) -> Densification | None:
-    """Return the densification events of a strategy; None without a strategy.
+    """Return the densification events of a strategy; None without one that names them as gsplat's do.
 
     MCMC adds a constant share of Gaussians per event, so all of its events are kept.
     """
-    if strategy is None:
+    first, every = getattr(strategy, "refine_start_iter", 0), getattr(strategy, "refine_every", None)
+    if every is None:
         return None
-    first, every = getattr(strategy, "refine_start_iter", 0), strategy.refine_every
     mcmc = is_mcmc(strategy)
     reset, pause = getattr(strategy, "reset_every", every), getattr(strategy, "pause_refine_after_reset", 0)
 
@@ -119,16 +139,28 @@ def _resets_in(test: ast.If) -> bool:
 def leave_out_noise(hooks: Hooks, strategy: Any, owner: Any) -> range:
     """Leave out MCMC's noise together with the gradient step: alone it is a random walk.
 
+    The rate of the noise is zero in a skipped iteration. What else the method of a strategy does happens as ever.
+
     Args:
         hooks: Hooks of the trainer.
         strategy: The strategy; nothing happens unless it is MCMC.
         owner: Where to replace `step_post_backward`: the strategy, or its class.
 
     Returns:
-        Iterations that must not be skipped, because relocation is in the same method as the noise. They matter only
-        to a gate that starts before relocation ends.
+        Iterations that must not be skipped, because they relocate. They matter only to a gate that starts before
+        relocation ends.
     """
     if not is_mcmc(strategy):
         return range(0)
-    hooks.suppress_on_skip(owner, "step_post_backward")
-    return range(0, strategy.refine_stop_iter, strategy.refine_every)
+
+    def around(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        rate = strategy.noise_lr
+        if hooks.state.skipped:
+            strategy.noise_lr = 0.0
+        try:
+            return original(*args, **kwargs)
+        finally:
+            strategy.noise_lr = rate
+
+    hooks.wrap(owner, "step_post_backward", around)
+    return range(0, getattr(strategy, "refine_stop_iter", 0), getattr(strategy, "refine_every", 1))

@@ -10,7 +10,7 @@ import inspect
 import math
 import textwrap
 from collections import ChainMap
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any
@@ -40,12 +40,13 @@ from skipgs_plug.core.source.functions import (
 )
 from skipgs_plug.core.source.substitution import returned
 
-# They represent uses of attributes among the names of calls: assignments to a tensor's `data` and to the option that
-# ends densification, and reads of a tensor's gradient by code that does not expect that there may be none.
-ASSIGNED, SETS_END, READS_GRADIENT = "data =", "densify_until_iter =", ".grad"
+# They represent uses of attributes among the names of calls: assignments to a tensor's `data` and to the options that
+# end densification, and reads of a tensor's gradient by code that does not expect that there may be none.
+ASSIGNED, SETS_END, READS_GRADIENT = "data =", "end of densification =", ".grad"
 _USES = {
     ("data", ast.Store): ASSIGNED,
     ("densify_until_iter", ast.Store): SETS_END,
+    ("refine_stop_iter", ast.Store): SETS_END,
     ("grad", ast.Load): READS_GRADIENT,
     ("absgrad", ast.Load): READS_GRADIENT,
 }
@@ -93,6 +94,7 @@ class CallReader:
         self._stops, self._windows = frozenset(stops), frozenset(windows)
         self._open: list[CodeType] = []  # code of the functions that are being read, outermost first
         self._expects_none = False  # whether a function that is being read compares a gradient with None
+        self._checked: set[ast.expr] = set()  # gradients that functions give a name, which they compare with None
 
     def read(self, function: Any, numbers: Collection[str], values: Mapping[str, Any], end: int | None = None) -> None:
         """Read a function or a bound method.
@@ -110,6 +112,7 @@ class CallReader:
             return
         outer = self._expects_none
         self._expects_none = outer or _expects_none(syntax)
+        self._checked.update(_checked_gradients(syntax))
         self._open.append(plain.__code__)
         self._body(syntax.body, self._scope(function, plain, syntax, numbers, values), end)
         self._open.pop()
@@ -129,6 +132,7 @@ class CallReader:
     def read_loops(self, function: ast.FunctionDef, scope: Scope) -> None:
         """Read the loops of a function, or all of it if it has none."""
         scope, self._expects_none = scope_inside(function, scope), _expects_none(function)
+        self._checked.update(_checked_gradients(function))
         for body in [loop.body for loop in outermost_loops(function)] or [function.body]:
             self._body(body, scope, None)
 
@@ -182,7 +186,9 @@ class CallReader:
             self._calls(part.orelse, scope, _sooner(end, self._end(part.test, scope, holds=False)))
             return
         if isinstance(part, ast.Attribute) and (use := _USES.get((part.attr, type(part.ctx)))) is not None:
-            if use != READS_GRADIENT or not self._expects_none:
+            # `absgrad` is also the name of an option.
+            expected = self._expects_none or part in self._checked or isinstance(value_of(part, scope), bool)
+            if use != READS_GRADIENT or not expected:
                 self.note(use, end)
         elif isinstance(part, ast.Call):
             name = getattr(part.func, "attr", getattr(part.func, "id", None))
@@ -236,6 +242,8 @@ class CallReader:
         numbers = {parameter for parameter, value in given if offset_of(value, scope) == 0}.difference(stored(syntax))
         # Attributes of the object have the same name in all of its methods.
         numbers |= {text for text in scope.numbers if text.startswith("self.") and owner is scope.values.get("self")}
+        if scope.code is not None and scope.code.co_name == syntax.name:  # of the parent, which may have the loop
+            numbers |= scope.numbers
         values = {parameter: value_of(value, scope) for parameter, value in given if parameter not in numbers}
         return numbers, {text: value for text, value in values.items() if value is not None}
 
@@ -335,12 +343,24 @@ def _ask(part: ast.AST, into: set[str], but: Collection[int] = ()) -> None:
 
 def _expects_none(function: ast.FunctionDef) -> bool:
     """Whether a function asks somewhere whether there is a gradient."""
-    compared = [[node.left, *node.comparators] for node in ast.walk(function) if isinstance(node, ast.Compare)]
-    return any(
-        any(isinstance(side, ast.Attribute) and side.attr == "grad" for side in sides)
-        and any(isinstance(side, ast.Constant) and side.value is None for side in sides)
-        for sides in compared
-    )
+    return any(isinstance(side, ast.Attribute) and side.attr == "grad" for side in _compared_with_none(function))
+
+
+def _checked_gradients(function: ast.FunctionDef) -> Iterator[ast.expr]:
+    """Yield the gradients in a function that it gives a name, as in `grad = means.grad`, `if grad is None`."""
+    names = {side.id for side in _compared_with_none(function) if isinstance(side, ast.Name)}
+    for statement in ast.walk(function):
+        match statement:
+            case ast.Assign([ast.Name(name)], ast.Attribute(attr="grad") as value) if name in names:
+                yield value
+
+
+def _compared_with_none(function: ast.FunctionDef) -> Iterator[ast.expr]:
+    for node in ast.walk(function):
+        if isinstance(node, ast.Compare):
+            sides = [node.left, *node.comparators]
+            if any(isinstance(side, ast.Constant) and side.value is None for side in sides):
+                yield from sides
 
 
 def _sooner(one: int | None, other: int | None) -> int | None:

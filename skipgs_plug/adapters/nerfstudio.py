@@ -9,7 +9,7 @@ from typing import Any
 
 from skipgs_plug.adapters.base import AbstractAdapter, refuse_other_processes
 from skipgs_plug.adapters.gsplat_strategy import (
-    gradients_read_until,
+    first_iterations,
     iterations_that_run,
     leave_out_noise,
     strategy_events,
@@ -100,12 +100,10 @@ class Nerfstudio(AbstractAdapter):
         self._relocations = leave_out_noise(hooks, strategy, strategy)
         self.output_folder = getattr(trainer, "base_dir", None)
         last = trainer.config.max_num_iterations - 1
-        # Before 1.1.5, and in many methods of others, the model densifies by itself, by the gradients that it reads.
-        read_until = survey.end_of_gradients(last) if strategy is None else gradients_read_until(strategy)
-        start = read_until if strategy is None else strategy.refine_stop_iter
+        start, read_until = first_iterations(survey, strategy, last)
         hooks.ready(
             TrainerInfo(
-                None if start is None else survey.start_after_changes(start, last),
+                start,
                 view_names=names,
                 max_steps=last,
                 world_size=trainer.world_size,

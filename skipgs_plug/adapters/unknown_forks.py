@@ -162,7 +162,7 @@ def refuse_loop_elsewhere(code: LoopCode, who: str) -> None:
         )
 
 
-def refuse_loop_without_end(ends: Mapping[str, int | None], last: int, who: str) -> None:
+def refuse_loop_without_end(ends: Mapping[str, int | None], last: float, who: str) -> None:
     """Raise an error if a loop reads gradients until its end, or sets the end of densification itself.
 
     Args:
@@ -174,19 +174,11 @@ def refuse_loop_without_end(ends: Mapping[str, int | None], last: int, who: str)
         AdapterMismatchError: It does. GES logs norms of gradients, also in the last iteration, before it saves.
             Binocular3DGS puts the end off when its opacities begin to decay.
     """
-    refuse_gradients_until_end(ends, last, who)
     if SETS_END in ends:
         raise AdapterMismatchError(
-            f"{who}: its loop itself sets densify_until_iter, so it is not known when densification ends. {BY_HAND}"
+            f"{who}: its loop itself sets densify_until_iter or refine_stop_iter, so it is not known when "
+            f"densification ends. {BY_HAND}"
         )
-
-
-def refuse_gradients_until_end(ends: Mapping[str, int | None], last: int, who: str) -> None:
-    """Raise an error if a trainer reads gradients in its last iteration; arguments as for `refuse_loop_without_end`.
-
-    Raises:
-        AdapterMismatchError: It does.
-    """
     until = ends.get(READS_GRADIENT, 0)
     if until is None or until > last:
         raise AdapterMismatchError(
@@ -254,16 +246,16 @@ class Survey:
         called = self._reader.ends.keys() & self._methods - self._known
         return sorted(changing(called))
 
-    def end_of_gradients(self, last: int) -> int | None:
+    def end_of_gradients(self, last: float) -> int | None:
         """Return the first iteration from which on the trainer reads no gradients; None if it never reads any.
 
         Args:
             last: Last iteration of the run.
 
         Raises:
-            AdapterMismatchError: It reads them until the end of the run.
+            AdapterMismatchError: It reads them until the end of the run, or moves the end of its densification.
         """
-        refuse_gradients_until_end(self._reader.ends, last, f"Adapter {self._adapter.name!r} cannot gate this trainer")
+        refuse_loop_without_end(self._reader.ends, last, f"Adapter {self._adapter.name!r} cannot gate this trainer")
         return self._reader.ends.get(READS_GRADIENT)
 
     def start_after_changes(self, start: int, last: float = math.inf, unit: int = 1) -> int:
@@ -283,7 +275,7 @@ class Survey:
                 f"The trainer does more than {checked}, for which adapter {name!r} was written. Recognised: "
                 f"{', '.join(recognised)}. {left_alone(map(spelled, self.unknown))}"
             )
-        names = self._changes.union(self.unknown)
+        names = self._changes.union(self.unknown, [READS_GRADIENT])
         ends = {name: end * unit for name, end in self._reader.ends.items() if end is not None and name in names}
         return begin_after(start, last, ends)
 

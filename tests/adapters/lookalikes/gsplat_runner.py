@@ -51,7 +51,7 @@ class MCMCStrategy:
             log.structure.append((step, "relocate", len(params["xyz"])))
             log.behind[step] = 0  # relocation reads no gradients
         with torch.no_grad():
-            params["xyz"] += torch.randn_like(params["xyz"]) * lr * 0.1
+            params["xyz"] += torch.randn_like(params["xyz"]) * lr * self.noise_lr * 2e-7
 
 
 class Dataset:
