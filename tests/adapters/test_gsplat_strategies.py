@@ -143,10 +143,13 @@ def test_gradients_that_are_compared_with_none_under_a_name_are_expected_to_be_n
         if grad is None:
             dense(values)
 
+    def asserted(values):
+        assert values[0].grad is not None
+
     found = {}
-    for function in (sparse, dense, both):
+    for function in (sparse, dense, both, asserted):
         reader = CallReader()
         reader.trainer.add(function)
         reader.read(function, {"step"}, {})
         found[function] = READS_GRADIENT in reader.ends
-    assert found == {sparse: False, dense: True, both: True}
+    assert found == {sparse: False, dense: True, both: True, asserted: True}
