@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -17,7 +18,11 @@ from skipgs_plug.adapters.gsplat_strategy import (
 )
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode, function_names
+from skipgs_plug.core.caution import caution
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.source.conditions import is_point, leaves
+from skipgs_plug.core.source.functions import syntax_of, undecorated
+from skipgs_plug.core.source.milestones import BY_ALWAYS
 from skipgs_plug.core.trainer_info import TrainerInfo
 
 MODULE = "nerfstudio.engine.trainer"
@@ -91,6 +96,8 @@ class Nerfstudio(AbstractAdapter):
         survey.read(trainer.train, "step")
         for callback, end in callbacks(trainer):
             survey.read(callback, "step", "self.step", end=end)
+        if hooks.state.config.leaves_out and hooks.state.config.always is None:
+            warn_of_conditions(pipeline.get_train_loss_dict, pipeline.datamanager.next_train)
         hooks.wrap(pipeline, "get_train_loss_dict", forwarded)
         hooks.wrap(pipeline.datamanager, "next_train", batch_made)
         hooks.gate_tensor_backward(LOOP)
@@ -116,15 +123,44 @@ class Nerfstudio(AbstractAdapter):
         return step in self._relocations
 
     def always_run(self, numbers: range) -> Iterable[int]:
-        """Return evaluations, and first and last iterations of accumulated gradients: the loop does not show them."""
+        """Return evaluations, calls of callbacks by number, and first and last iterations of accumulated gradients.
+
+        The loop does not show them.
+        """
         config = self.trainer.config
         every = (config.steps_per_eval_batch, config.steps_per_eval_image, config.steps_per_eval_all_images)
         gathered = [steps for steps in config.gradient_accumulation_steps.values() if steps > 1]
         yield from iterations_that_run(getattr(self.trainer.pipeline.model, "strategy", None), numbers)
         for n in numbers:
             evaluates = any(interval and n % interval == 0 for interval in every)
-            if evaluates or any(n % steps in (0, steps - 1) for steps in gathered):
+            calls = any(called_at(callback, n) for callback in self.trainer.callbacks)
+            if evaluates or calls or any(n % steps in (0, steps - 1) for steps in gathered):
                 yield n
+
+
+def called_at(callback: Any, step: int) -> bool:
+    """Whether a callback names an iteration by its interval or in its list; in a list without gaps, none is named."""
+    every, steps = getattr(callback, "update_every_num_iters", None), getattr(callback, "iters", None)
+    if every is not None:
+        return every > 1 and step % every == 0
+    return steps is not None and step in steps and not {step - 1, step + 1}.intersection(steps)
+
+
+def warn_of_conditions(*functions: Callable[..., Any]) -> None:
+    """Warn of conditions on the iteration's number in functions that nerfstudio calls, which are not read ahead.
+
+    nerfstudio itself has none there. Methods that edit their images in some iterations have.
+    """
+    for plain in filter(None, map(undecorated, functions)):
+        syntax = syntax_of(plain)
+        tests = [node.test for node in ast.walk(syntax) if isinstance(node, ast.If)] if syntax is not None else []
+        for leaf in (leaf for test in tests for leaf in leaves(test)):
+            by_number = any(isinstance(part, ast.Name) and part.id == "step" for part in ast.walk(leaf))
+            if by_number and isinstance(leaf, (ast.BinOp, ast.Compare)) and is_point(leaf):
+                caution(
+                    f"{plain.__qualname__}() has a condition on the iteration's number that is not read "
+                    f"({ast.unparse(leaf)}), so iterations that it needs could be left out; {BY_ALWAYS}."
+                )
 
 
 def callbacks(trainer: Any) -> Iterator[tuple[Callable[..., Any], int | None]]:

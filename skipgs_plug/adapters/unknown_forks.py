@@ -182,8 +182,9 @@ def refuse_loop_without_end(ends: Mapping[str, int | None], last: float, who: st
     until = ends.get(READS_GRADIENT, 0)
     if until is None or until > last:
         raise AdapterMismatchError(
-            f"{who}: its loop reads gradients (grad) until its end, for example to log them or to densify, and a skipped "
-            f"iteration has none. Switch that off if the script has an option for it, such as one for the log. {BY_HAND}"
+            f"{who}: its loop reads gradients (grad) until its end, for example to log them or to densify, and a "
+            "skipped iteration has none. Switch that off if the script has an option for it, such as one for the log. "
+            f"{BY_HAND}"
         )
 
 

@@ -2,6 +2,7 @@
 
 import sys
 import types
+import warnings
 
 import pytest
 import torch
@@ -200,3 +201,55 @@ def test_training_by_another_function_is_warned_of_once(enabled, recwarn):
     said = [str(one.message) for one in recwarn]
     assert len(said) == enabled
     assert all("fit() called backward, and no module nerfstudio.engine.trainer was seen" in one for one in said)
+
+
+class Called(types.SimpleNamespace):
+    """A callback of nerfstudio: it calls its function by an interval, or in a list of iterations."""
+
+    def __call__(self, step):
+        every = getattr(self, "update_every_num_iters", None)
+        if step % every == 0 if every else step in self.iters:
+            self.func(step)
+
+
+def test_iterations_that_callbacks_name_always_run():
+    new_log()
+    model, calls = nerfstudio.Model(nerfstudio.DefaultStrategy()), []
+
+    def noted(step):
+        calls.append(step)
+
+    trainer = of_model(
+        model,
+        model.step_post_backward,
+        Called(func=noted, update_every_num_iters=11),
+        Called(func=noted, iters=(37, 52)),
+    )
+    with SkipGate(trainer, refine_share=0.2) as gate:
+        trainer.train()
+    assert calls == [0, 11, 22, 33, 37, 44, 52, 55] and gate.report()["iterations_skipped"] > 0
+
+
+class Editing(nerfstudio.Pipeline):
+    """Edits its images in some iterations, as Instruct-GS2GS does."""
+
+    def get_train_loss_dict(self, step):
+        if (step - 1) % 7 == 0 and step > 1:
+            self.edited = step
+        return super().get_train_loss_dict(step)
+
+
+def test_conditions_of_a_pipeline_are_warned_of():
+    def trainer():
+        made = nerfstudio.Trainer().setup()
+        made.pipeline.__class__ = Editing
+        return made
+
+    sentence = r"Editing\.get_train_loss_dict\(\) has a condition on .* not read \(\(step - 1\) % 7 == 0\)"
+    with pytest.warns(RuntimeWarning, match=sentence) as said:
+        SkipGate(trainer(), refine_share=0.4).detach()
+    assert len(said) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        SkipGate(trainer(), refine_share=0.4, always=[7]).detach()
+        SkipGate(trainer(), **RULE).detach()
