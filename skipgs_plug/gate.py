@@ -115,6 +115,7 @@ class SkipGate:
         always: Iterable[int] | None = None,
         views: Iterable[Any] | None = None,
         events: Iterable[int] | None = None,
+        resets: Iterable[int] | None = None,
     ) -> LoopRange:
         """Return the iterations of your loop that run: `for step in gate.iterations(range(30_000))`.
 
@@ -133,6 +134,8 @@ class SkipGate:
             views: Keys of all training views. `share="auto"` and `refine_share="auto"` need them.
             events: Iterations in which your loop densifies, such as `range(600, 15_000, 100)`. `share` leaves out
                 some of them.
+            resets: Iterations in which your loop resets opacities; an empty list if it never does. `share` then takes
+                longer steps. None if they are unknown.
 
         Raises:
             SkipGSError: `numbers` is not a range with step 1. Before training has begun, the gate also raises it if
@@ -149,7 +152,7 @@ class SkipGate:
         """
         frame = sys._getframe(1)
         source = (frame.f_code, {**frame.f_globals, **frame.f_locals})
-        return self._loop.iterations(numbers, source, always, views, events)
+        return self._loop.iterations(numbers, source, always, views, events, resets)
 
     def backward(self, loss: Any, view: Any, step: int, *, signal: Any = None) -> bool:
         """Run `loss.backward()`, or skip it; return True when gradients were computed.

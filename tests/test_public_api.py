@@ -29,7 +29,7 @@ GATE = {
     "iterations": (
         "(self, numbers: 'range', *, always: 'Iterable[int] | None' = None, "
         "views: 'Iterable[Any] | None' = None, "
-        "events: 'Iterable[int] | None' = None) -> 'LoopRange'"
+        "events: 'Iterable[int] | None' = None, resets: 'Iterable[int] | None' = None) -> 'LoopRange'"
     ),
     "backward": "(self, loss: 'Any', view: 'Any', step: 'int', *, signal: 'Any' = None) -> 'bool'",
     "detach": "(self) -> 'None'",

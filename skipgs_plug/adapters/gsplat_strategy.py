@@ -29,6 +29,7 @@ CHANGES = (
 )
 # Further methods of a strategy, and functions, that change no parameters: noise is left out with the gradient step.
 KNOWN = ("check_sanity", "initialize_state", "inject_noise_to_position")
+Resets = Callable[[int], bool]
 STAGES = ("step_pre_backward", "step_post_backward", "_update_state")
 
 
@@ -68,10 +69,14 @@ def first_iterations(survey: Survey, strategy: Any, last: int) -> tuple[int | No
     return (None if start is None else survey.start_after_changes(start, last)), read_until
 
 
-def strategy_events(strategy: Any) -> Densification | None:
+def strategy_events(strategy: Any, resets: Resets | None = None) -> Densification | None:
     """Return the densification events of a strategy; None without one that names them as gsplat's do.
 
     MCMC adds a constant share of Gaussians per event, so all of its events are kept.
+
+    Args:
+        strategy: The strategy.
+        resets: Whether an iteration resets opacities; by default as in the strategy's source.
     """
     first, every = getattr(strategy, "refine_start_iter", 0), getattr(strategy, "refine_every", None)
     if every is None:
@@ -86,12 +91,12 @@ def strategy_events(strategy: Any) -> Densification | None:
         numbers=lambda numbers: filter(acts, numbers),
         needs="nothing" if mcmc else "visits",
         resets=not mcmc,
-        reset_numbers=None if mcmc else lambda numbers: _resets(strategy, numbers),
+        reset_numbers=None if mcmc else lambda numbers: filter(resets or resets_of(strategy), numbers),
     )
 
 
-def iterations_that_run(strategy: Any, numbers: range) -> Iterable[int]:
-    """Return the iterations until densification ends that must all run.
+def iterations_that_run(strategy: Any, numbers: range, resets: Resets | None = None) -> Iterable[int]:
+    """Return the iterations until densification ends that must all run; arguments as for `strategy_events`.
 
     They reset opacities, or Gaussians are split in them by the largest size that they had on the screen in any step
     (`refine_scale2d_stop_iter`, nerfstudio's default). With fewer, longer steps sizes overshoot: splatfacto ended with
@@ -99,17 +104,17 @@ def iterations_that_run(strategy: Any, numbers: range) -> Iterable[int]:
     """
     stop = getattr(strategy, "refine_stop_iter", 0)
     by_size = getattr(strategy, "refine_scale2d_stop_iter", 0)
-    resets = set(_resets(strategy, numbers))
-    return (n for n in numbers if n < min(stop, by_size) or n in resets)
+    resets = resets or resets_of(strategy)
+    return (n for n in numbers if n < min(stop, by_size) or resets(n))
 
 
-def _resets(strategy: Any, numbers: range) -> Iterable[int]:
-    """Return the iterations of a range that reset opacities."""
+def resets_of(strategy: Any) -> Resets:
+    """Return whether an iteration resets opacities: by the source of a strategy, else by its settings."""
     every, stop = getattr(strategy, "reset_every", 0), getattr(strategy, "refine_stop_iter", 0)
     holds = _reset_condition(undecorated(getattr(strategy, "step_post_backward", None)))
     if holds is None:
-        return (n for n in numbers if every and 0 < n < stop and n % every == 0)
-    return (n for n in numbers if 0 < n < stop and holds(strategy, n))
+        return lambda n: 0 < n < stop and bool(every) and n % every == 0
+    return lambda n: 0 < n < stop and holds(strategy, n)
 
 
 @functools.cache

@@ -43,8 +43,11 @@ class ReferenceTrainer(AbstractAdapter):
             hooks.iteration(step)
             hooks.backward(loss, lambda: original(loss, view, step), view)
 
+        def always_run(numbers: range) -> Iterable[int]:
+            return iterations_that_run(trainer.strategy, numbers, trainer.resets_opacities)
+
         hooks.wrap(trainer, "backward", gated)
-        hooks.own_loop(trainer, "iterations", always=lambda numbers: iterations_that_run(trainer.strategy, numbers))
+        hooks.own_loop(trainer, "iterations", always=always_run)
         views = trainer.scene.train
         halves = hooks.may_halve and all(can_be_halved(view.height, view.width) for view in views)
         if halves:
@@ -79,5 +82,5 @@ def _densification(trainer: Any) -> Densification | None:
     """Events of the trainer's strategy; MCMC adds a constant share of Gaussians per event, so all are kept."""
     mcmc = trainer.mcmc
     if mcmc is None:
-        return strategy_events(trainer.strategy)
+        return strategy_events(trainer.strategy, trainer.resets_opacities)
     return Densification(numbers=lambda numbers: filter(mcmc.moves, numbers), needs="nothing", resets=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
@@ -16,6 +16,7 @@ from skipgs_plug.core.optimizers import has_pending_gradient, listed
 from skipgs_plug.core.pace.base import EveryNumber, Source
 from skipgs_plug.core.pace.loop_range import LoopRange
 from skipgs_plug.core.pace.schedulers import schedulers_caught_up
+from skipgs_plug.core.trainer_info import Densification
 from skipgs_plug.core.views import NOT_READ, view_key
 
 
@@ -48,6 +49,7 @@ class OwnLoop:
         always: Iterable[int] | None,
         views: Iterable[Any] | None,
         events: Iterable[int] | None,
+        resets: Iterable[int] | None,
     ) -> LoopRange:
         """Return the iterations that run.
 
@@ -57,6 +59,7 @@ class OwnLoop:
             always: Iterations that must run; see `Pace.follow`.
             views: Keys of all training views; None if they are unknown.
             events: Iterations that densify; None if they are unknown.
+            resets: Iterations that reset opacities; None if they are unknown.
 
         Raises:
             SkipGSError: See `SkipGate.iterations`.
@@ -65,10 +68,14 @@ class OwnLoop:
             raise SkipGSError("iterations() takes a range that goes up by one, such as range(30_000).")
         if isinstance(views, str):
             raise SkipGSError(f"views= takes a list of all names of training views, not the one name {views!r}.")
+        if resets is not None and events is None:
+            raise SkipGSError("resets= is for loops whose densification events are known: give events=, too.")
         with self.guarded:
             keys = list(dict.fromkeys(view_key(view) for view in (() if views is None else views))) or None
             pace, on_error = self._engine.pace, self._release.on_error
-            loop = pace.follow(numbers, source, always, keys, events)
+            reset_numbers = None if resets is None else _among(resets)
+            known = None if events is None else Densification(numbers=_among(events), reset_numbers=reset_numbers)
+            loop = pace.follow(numbers, source, always, keys, known)
             if pace.leaves_out and not self._release.attached:  # adapters step the schedulers of their trainers
                 loop.around = lambda: schedulers_caught_up(pace, lambda error: on_error(error, pace.number))
             return loop
@@ -227,3 +234,8 @@ def _is_index_on_device(view: Tensor) -> bool:
 
 def _backward_of_sum(losses: Iterable[Tensor]) -> None:
     torch.stack(list(losses)).sum().backward()
+
+
+def _among(numbers: Iterable[int]) -> Callable[[range], Iterable[int]]:
+    """Return a function that returns which of these numbers are in a range."""
+    return frozenset(int(number) for number in numbers).intersection

@@ -30,6 +30,7 @@ from skipgs_plug.trainer.ply import write_ply
 from skipgs_plug.trainer.rendering import ViewRenderer
 from skipgs_plug.trainer.scene import Scene, View
 from skipgs_plug.trainer.state import Stateful
+from skipgs_plug.trainer.strategy import resets_in
 
 MEANS_LR_END = 0.01  # learning rate of positions at the end of the schedule, as a share of the first; 3DGS's value
 
@@ -174,6 +175,10 @@ class Trainer:
             until: Iteration before which training stops.
         """
         return range(self.step, until)
+
+    def resets_opacities(self, step: int) -> bool:
+        """Whether opacities are reset in an iteration."""
+        return self.strategy is not None and resets_in(self.strategy, step)
 
     @single_precision()
     def train_step(self) -> float:

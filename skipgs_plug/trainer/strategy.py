@@ -79,6 +79,11 @@ def reset_interval(config: TrainConfig) -> int:
     return max(every, -(-stop // (resets + 1)))
 
 
+def resets_in(strategy: Any, step: int) -> bool:
+    """Whether opacities are reset in an iteration of this trainer, by the strategy or by `reset_opacity_if_missed`."""
+    return 0 < step < strategy.refine_stop_iter and step % strategy.reset_every == 0
+
+
 def reset_opacity_if_missed(
     strategy: Any,
     splats: nn.ParameterDict,
@@ -92,7 +97,7 @@ def reset_opacity_if_missed(
     `step % reset_every == 0 and 0 > 0`, so its reset never happens. A strategy that did reset leaves no opacity above
     the reset value, so this does nothing with a repaired gsplat.
     """
-    if step == 0 or step % strategy.reset_every or step >= strategy.refine_stop_iter:
+    if not resets_in(strategy, step):
         return False
     value = 2.0 * strategy.prune_opa
     if not bool((torch.sigmoid(splats["opacities"]) > 1.001 * value).any()):

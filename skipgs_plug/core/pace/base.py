@@ -66,7 +66,7 @@ class Pace:
         source: Source | None,
         always: Iterable[int] | None = None,
         views: list[str] | None = None,
-        events: Iterable[int] | None = None,
+        densification: Densification | None = None,
     ) -> LoopRange:
         """Return the loop that replaces `numbers` in a training loop of the user's own.
 
@@ -76,7 +76,7 @@ class Pace:
             always: Iterations that must run besides those that conditions name. Conditions that cannot be read are no
                 error then. None if the user named none.
             views: Keys of all training views; None if the trainer's adapter passes them.
-            events: Iterations that densify; None if they are unknown, or if the trainer's adapter knows them.
+            densification: Densification events; None if they are unknown, or if the trainer's adapter knows them.
 
         Raises:
             SkipGSError: The numbers go on after those of an earlier plan.

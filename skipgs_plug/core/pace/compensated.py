@@ -11,7 +11,7 @@ from skipgs_plug.core.pace.base import EveryNumber, Pace, Source
 from skipgs_plug.core.pace.loop_range import LoopRange, require_planned
 from skipgs_plug.core.pace.rates import ScaledRates, path_factor
 from skipgs_plug.core.policy import Policy
-from skipgs_plug.core.trainer_info import TrainerInfo
+from skipgs_plug.core.trainer_info import Densification, TrainerInfo
 
 
 class Compensated(Pace):
@@ -39,7 +39,7 @@ class Compensated(Pace):
         source: Source | None,
         always: Iterable[int] | None = None,
         views: list[str] | None = None,
-        events: Iterable[int] | None = None,
+        densification: Densification | None = None,
     ) -> LoopRange:
         self._plan(numbers)
         return LoopRange(numbers, EveryNumber(self._rates.pause))

@@ -79,6 +79,7 @@ class Growing(Phase):
         self.half_size = HalfSize(config)
         self._fading = False  # whether the points that the scene began with faded
         self._reset: int | None = None  # iteration of the last opacity reset; None without one, or if it is unknown
+        self._resets = True  # whether opacities are reset in this phase, or it is not known
         self._whole_from: int | None = None  # iteration from which all run, because no refinement follows
         self._end = self._steps_after = 0  # end of the phase, and number of iterations that will run in the following
         self._saved_events: dict[str, Any] | None = None
@@ -122,10 +123,12 @@ class Growing(Phase):
         # again soon.
         rare = [hits for hits in others.values() if len(hits) < len(events)]
         common = [hits for hits in others.values() if len(hits) >= len(events)]
-        self._must = frozenset(named).union(*rare, *(hits - events for hits in common))
+        self._must = frozenset(named).union(resets, *rare, *(hits - events for hits in common))
         if self._first is None:
             self._first = numbers.start
         self._reset, self._end = max(resets, default=None), numbers.stop
+        known = densification.reset_numbers is not None or bool(densification.reset_marks)
+        self._resets = densification.resets and (self._reset is not None or not known)
         following = plan.last + 1 - numbers.stop
         if following > 0:
             asked = self._config.refining
@@ -221,7 +224,7 @@ class Growing(Phase):
                 self._rates.look()
             return True
         factor, parts = self._factors(number)
-        if parts.opacities > 1.0:
+        if max(factor, parts.opacities) > 1.0:
             self._rates.scale(factor, parts)
         elif self._measuring or self._config.max_gaussians is not None:
             self._rates.look()
@@ -307,11 +310,17 @@ class Growing(Phase):
         ends = number >= self._first + self._length  # whether only prunes and terms of the loss follow
         share = max(self._share_now or self.share, self._must_shares[ends])
         grown = self._times_grown
-        factor = growing_factor(self._length, share, self._visible, events.all_run, grown, events.resets)
+        factor = growing_factor(self._length, share, self._visible, events.all_run, grown, self._resets)
         # A reset takes random points away. Without one, long steps would make them large, and they would stay.
         stay = self._fading and self._reset is None
         positions = 1.0 if stay else positions_part(factor, events.resets)
-        return factor, GrowingParts(opacity_factor(share), positions, events.clears_moments, scales_stay=stay)
+        return factor, GrowingParts(
+            self._opacity_factor(events, share), positions, events.clears_moments, scales_stay=stay
+        )
+
+    def _opacity_factor(self, events: DensificationEvents, share: float) -> float:
+        """Return the factor on the rate of opacities: they recover from resets or MCMC's regulariser, or must fade."""
+        return opacity_factor(share) if self._resets or self._fading or not events.resets else 1.0
 
     @property
     def _times_grown(self) -> float | None:

@@ -67,11 +67,11 @@ class LoopFacts:
         """Receive facts from the trainer's adapter; see `Pace.describe`."""
         self._always, self._pure, self.densification, self._known = always, tuple(pure), densification, known
 
-    def choose(self, always: Iterable[int] | None, views: list[str] | None, events: Iterable[int] | None) -> None:
+    def choose(
+        self, always: Iterable[int] | None, views: list[str] | None, densification: Densification | None
+    ) -> None:
         """Receive facts about a loop of the user's own; see `Pace.follow`."""
-        if events is not None:
-            known = frozenset(int(number) for number in events)
-            self.densification = Densification(numbers=lambda part: known.intersection(part))
+        self.densification = densification or self.densification
         self._chosen = self._given.union(always or ())
         self._others_named = self._others_named or always is not None
         if views is not None:

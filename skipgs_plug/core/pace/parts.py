@@ -274,7 +274,7 @@ def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
         return ScaledGroup(info.group, OTHERS_AT_MOST, 1.0, None) if growing is None else None
     if info.part is None:
         times = (1.0 if growing is None else growing.opacities) * _recovering(info.rate, opacity_rate)
-        if growing is None or times > 1.0:
+        if growing is None or times > 1.0 or (raised and not growing.only_higher_bands):
             remembers = growing is not None and growing.opacities_remember
             return ScaledGroup(info.group, times, 1.0, None if remembers else info)
         return None

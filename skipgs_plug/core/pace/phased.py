@@ -88,9 +88,9 @@ class Phased(Pace):
         source: Source | None,
         always: Iterable[int] | None = None,
         views: list[str] | None = None,
-        events: Iterable[int] | None = None,
+        densification: Densification | None = None,
     ) -> LoopRange:
-        self._facts.choose(always, views, events)
+        self._facts.choose(always, views, densification)
         self._require_planned(numbers)
         self._finder.found = LoopRange(numbers, self, source)
         return self._finder.found

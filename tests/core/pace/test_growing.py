@@ -310,3 +310,23 @@ def test_steps_conserve_the_path_in_any_schedule_if_opacities_are_never_reset():
     assert growing_factor(25_000, 0.1, 0.96, by_budget=True, resets=False) == 8.0  # the longest that pay
     assert growing_factor(25_000, 0.9, 1 / 3, by_budget=True, resets=False) == pytest.approx(1 / 0.9)
     assert positions_part(3.0, resets=False) == 2.0 and positions_part(8.0, resets=False) == 1.0
+    assert growing_factor(25_000, 0.1, 0.96, resets=False) == 5.0  # there, the number of Gaussians rises with them
+
+
+@pytest.mark.parametrize("resets, expected", [((), (5.0, 1.0)), ((390,), (4.0, 2.0)), (None, (4.0, 2.0))])
+def test_opacities_keep_their_rate_where_they_need_not_recover_from_resets(resets, expected):
+    loop = Opaque()
+    with SkipGate(start_iter=START, share=0.25) as gate:
+        loop.train(gate, resets=resets)
+    assert loop.between(200, 390) == {expected}
+    growing = gate.report()["growing"]
+    assert growing["rate_factor"] == (5.0 if resets == () else 3.0)
+    assert growing["opacity_rate_factor"] == expected[1]
+
+
+def test_resets_run_and_need_events():
+    gate = SkipGate(start_iter=START, share=0.25)
+    with pytest.raises(SkipGSError, match="resets= is for loops whose densification events are known: give events="):
+        gate.iterations(range(LAST), views=VIEWS, resets=[])
+    with gate:
+        assert {151, 307} <= set(Loop().train(gate, resets=[151, 307]).ran)
