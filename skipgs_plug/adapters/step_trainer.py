@@ -139,7 +139,7 @@ class StepTrainer(AbstractAdapter):
                 end,
                 view_names=self._views,
                 gradients_read_until=end,
-                densification=Densification(numbers=self.densification_events) if known else None,
+                densification=self.densification if known else None,
             )
         )
 
@@ -151,9 +151,16 @@ class StepTrainer(AbstractAdapter):
         resets = scheduled(self.trainer, "opacity_reset", numbers)
         return (n for n in numbers if n <= short or n in resets or any(n % interval == 0 for interval in raises))
 
-    def densification_events(self, numbers: range) -> Iterable[int]:
-        """Return the iterations in which Gaussians are added or pruned."""
-        return sorted(scheduled(self.trainer, "densify", numbers) | scheduled(self.trainer, "prune", numbers))
+    @property
+    def densification(self) -> Densification:
+        """The iterations in which Gaussians are added or pruned, and those in which opacities are reset."""
+
+        def events(numbers: range) -> Iterable[int]:
+            return sorted(scheduled(self.trainer, "densify", numbers) | scheduled(self.trainer, "prune", numbers))
+
+        return Densification(
+            numbers=events, reset_numbers=lambda numbers: scheduled(self.trainer, "opacity_reset", numbers)
+        )
 
 
 def scheduled(trainer: Any, kind: str, numbers: range) -> set[int]:
