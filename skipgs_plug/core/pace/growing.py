@@ -11,7 +11,6 @@ from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.pace.densification_events import DensificationEvents
 from skipgs_plug.core.pace.half_size import HalfSize
 from skipgs_plug.core.pace.needs import (
-    GROWING_STEPS_FROM_RANDOM,
     LAST_FACTOR,
     LEAST_GROWING_SHARE,
     MOST_RAISED_SHARE,
@@ -292,9 +291,9 @@ class Growing(Phase):
     def _warn_of_fading(self) -> None:
         """Warn if the share that the user gave is too small for a scene of random points."""
         assert self.share is not None
-        run = self.share * self._length
-        if self._has_longer_steps and run < GROWING_STEPS_FROM_RANDOM:
-            enough = min(1.0, math.ceil(100 * GROWING_STEPS_FROM_RANDOM / self._length) / 100)
+        run, enough = self.share * self._length, growing_share(self._length, self._epoch, longer=True, fading=True)
+        if self._has_longer_steps and self.share < enough:
+            enough = math.ceil(100 * enough) / 100
             caution(
                 f"The points that the scene began with fade, as random ones do. With a share of {self.share:g}, "
                 f"{run:,.0f} iterations run until densification ends, and such points can stay as haze: give "

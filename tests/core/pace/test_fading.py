@@ -51,6 +51,7 @@ def test_nothing_is_kept_after_the_answer():
 def test_a_scene_of_random_points_needs_more_iterations():
     assert growing_share(3500, 100, longer=True, fading=True) == GROWING_STEPS_FROM_RANDOM / 3500
     assert growing_share(1500, 17, longer=True, fading=True) == 1.0
+    assert growing_share(15_000, 255, longer=True, fading=True) == 12 * 255 / 15_000
 
 
 def train(gate, direction, until=LAST, note=None):
