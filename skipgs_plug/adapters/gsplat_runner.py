@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any
@@ -21,6 +22,7 @@ from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_code import LoopCode, function_names
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.hooks import Hooks
+from skipgs_plug.core.source.functions import undecorated
 from skipgs_plug.core.trainer_info import TrainerInfo
 from skipgs_plug.host_copy import HostCopy
 
@@ -71,7 +73,8 @@ class GsplatRunner(AbstractAdapter):
         ) -> Any:
             if START in hooks.awaited:  # a second training run finds its Runner attached to, which releases the gate
                 hooks.awaited.discard(START)
-                names = getattr(fn, "__globals__", {})  # a functools.partial has none
+                function = undecorated(fn.func if isinstance(fn, functools.partial) else fn)
+                names = {} if function is None else function.__globals__
                 if RUNNER not in names:
                     expected = f"a class {RUNNER} among the names of the function that the script passes to cli()"
                     raise self.mismatch(expected)

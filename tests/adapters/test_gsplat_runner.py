@@ -1,5 +1,6 @@
 """gsplat's Runner: MCMC's noise, batches, processes, and the script that builds it."""
 
+import functools
 import os
 import sys
 import types
@@ -135,6 +136,15 @@ def test_a_runner_of_a_derived_class_with_all_of_its_own_is_reached(gsplat_modul
     gate.verify()
     assert gate.report()["iterations"] == 60 and gate.report()["backwards_skipped"] > 0
     assert not any(hasattr(kind.__init__, "__skipgs_plug__") for kind in (parent, own))
+
+
+def test_a_function_with_some_arguments_given_is_reached(gsplat_module):
+    new_log()
+    names = {"Runner": type("Runner", (Runner,), {}), "DefaultStrategy": DefaultStrategy}
+    exec("def main(quick, local_rank, world_rank, world_size, cfg):\n    Runner(DefaultStrategy()).train()\n", names)
+    with SkipGate(adapter="gsplat", **RULE) as gate:
+        gsplat_module.cli(functools.partial(names["main"], True), None)
+    assert gate.report()["iterations"] == 60
 
 
 def test_a_script_that_starts_its_function_itself_is_refused_with_its_first_backward(gsplat_module):
