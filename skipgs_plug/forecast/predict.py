@@ -12,6 +12,7 @@ import numpy as np
 from skipgs_plug.core.pace.needs import for_new_gaussians, growing_share, refining_share
 from skipgs_plug.forecast.pilot import Pilot
 from skipgs_plug.trainer.config import TrainConfig
+from skipgs_plug.trainer.strategy import reset_interval
 
 # The duration of an iteration grows with a power of the number of Gaussians. Whole runs on fern show a power of one
 # half. A pilot corrects it, by more if its own numbers of Gaussians differ more.
@@ -55,7 +56,12 @@ class Forecast:
 
 def predict(pilot: Pilot, config: TrainConfig, max_steps: int) -> Forecast:
     """Return the forecast of a run of `max_steps` iterations with the settings of the pilot."""
-    schedule = TrainConfig(strategy=config.strategy, refine_stop_iter=config.refine_stop_iter, max_steps=max_steps)
+    schedule = TrainConfig(
+        strategy=config.strategy,
+        refine_stop_iter=config.refine_stop_iter,
+        reset_every=config.reset_every,
+        max_steps=max_steps,
+    )
     stop = min(schedule.scaled(schedule.recipe.refine_stop_iter), max_steps)
     growth = fit_growth(pilot, config)
     cost = fit_cost(pilot)
@@ -68,7 +74,8 @@ def predict(pilot: Pilot, config: TrainConfig, max_steps: int) -> Forecast:
     costs = [cost(number) for number in numbers]
     per_growing = mean(costs)
     per_refining = cost(grown)
-    growing = growing_share(stop, pilot.views, longer=pilot.visible is not None, fading=pilot.fading) * stop
+    longer, resets = pilot.visible is not None, schedule.strategy == "mcmc" or reset_interval(schedule) < stop
+    growing = growing_share(stop, pilot.views, longer, fading=pilot.fading, resets=resets) * stop
     left = max_steps - stop
     refining = refining_share(left, pilot.views, grown=stop) * left if left else 0.0
     more = grown - max(sample.gaussians for sample in pilot.samples)

@@ -286,7 +286,8 @@ class Growing(Phase):
         if self._auto:
             longer = self._config.compensates and self._visible is not None
             events = len(self.events) if self.events.all_run else 0
-            self.share = growing_share(self._length, self._epoch, longer, events, self._fading)
+            resets = self._resets or not self.events.resets  # MCMC's regulariser acts like resets
+            self.share = growing_share(self._length, self._epoch, longer, events, self._fading, resets)
 
     def _warn_of_fading(self) -> None:
         """Warn if the share that the user gave is too small for a scene of random points."""

@@ -25,6 +25,9 @@ def test_shares_that_auto_chooses():
     assert growing_share(15_000, 255, longer=True) == growing_share(15_000, 255, longer=False) == 0.1
     assert growing_share(15_000, 1000, longer=True) == growing_share(15_000, 1000, longer=False) == pytest.approx(1 / 3)
     assert growing_share(1500, 17, longer=True) == 0.4
+    assert growing_share(3500, 255, longer=True) == 5 * 255 / 3500
+    assert growing_share(3500, 255, longer=True, resets=False) == 4 * 255 / 3500  # steps are longer there
+    assert growing_share(3500, 255, longer=False, resets=False) == 5 * 255 / 3500
     assert growing_share(1500, 17, longer=False) == 0.8
     # Longer schedules run more iterations, but a smaller share of them.
     assert growing_share(3000, 46, longer=True) == pytest.approx(765 / 3000, abs=1e-3)
