@@ -15,6 +15,8 @@ from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any
 
+import torch
+
 from skipgs_plug.adapters.loop_names import (
     Scope,
     evaluated,
@@ -186,8 +188,10 @@ class CallReader:
             self._calls(part.orelse, scope, _sooner(end, self._end(part.test, scope, holds=False)))
             return
         if isinstance(part, ast.Attribute) and (use := _USES.get((part.attr, type(part.ctx)))) is not None:
-            # `absgrad` is also the name of an option.
-            expected = self._expects_none or part in self._checked or isinstance(value_of(part, scope), bool)
+            # `absgrad` is also the name of an option, which MCMC's strategy does not have.
+            owner = value_of(part.value, scope)
+            is_option = owner is not None and not isinstance(owner, torch.Tensor)
+            expected = self._expects_none or part in self._checked or is_option
             if use != READS_GRADIENT or not expected:
                 self.note(use, end)
         elif isinstance(part, ast.Call):

@@ -17,6 +17,7 @@ class DefaultStrategy:
     refine_every: int = 5
     reset_every: int = 8
     pause_refine_after_reset: int = 0
+    absgrad: bool = False
 
     def step_pre_backward(self, params, optimizers, state, step, info):
         info["means2d"].retain_grad()
@@ -85,6 +86,7 @@ class Runner:
         self.strategy_state = {}
 
     def rasterize_splats(self, camtoworlds, image_ids=None, **kwargs):
+        log.absgrad = self.cfg.strategy.absgrad if isinstance(self.cfg.strategy, DefaultStrategy) else False
         out = [draw(camera, self.splats, None if i else True) for i, camera in enumerate(camtoworlds)]
         return torch.stack([one["render"] for one in out]), None, {"means2d": out[0]["viewspace_points"]}
 
