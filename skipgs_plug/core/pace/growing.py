@@ -126,9 +126,7 @@ class Growing(Phase):
         if self._first is None:
             self._first = numbers.start
         self._reset, self._end = max(resets, default=None), numbers.stop
-        # Events that clear moments act like resets: with longer steps, FastGS ends with 126 % of its Gaussians on fern.
-        known = (densification.reset_numbers or densification.reset_marks) and not densification.clears_moments
-        self._resets = densification.resets and (self._reset is not None or not known)
+        self._resets = self.events.with_resets(self._reset is not None, numbers.stop)
         following = plan.last + 1 - numbers.stop
         if following > 0:
             asked = self._config.refining

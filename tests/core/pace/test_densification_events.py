@@ -92,3 +92,20 @@ def test_surplus_iterations_count_for_the_following_event_alone():
     resumed = DensificationEvents(range(100, 1001, 100), Densification())
     resumed.load_state_dict(events.state_dict())
     assert resumed.state_dict() == events.state_dict()
+
+
+@pytest.mark.parametrize(
+    "settings, found, stop, expected",
+    [
+        ({"reset_marks": ("opacity_reset_interval",)}, False, 1101, False),
+        ({"reset_marks": ("opacity_reset_interval",)}, True, 1101, True),
+        ({"reset_numbers": lambda numbers: []}, False, 1101, False),
+        ({}, False, 1101, True),  # it is not known
+        ({"resets": False}, False, 1101, False),
+        ({"reset_marks": ("opacity_reset_interval",), "clears_moments": True}, False, 1101, True),
+        ({"reset_marks": ("opacity_reset_interval",)}, False, 1501, True),  # a selection follows
+    ],
+)
+def test_steps_are_as_with_resets_unless_none_is_known_to_come(settings, found, stop, expected):
+    events = DensificationEvents(range(100, 1001, 100), Densification(**settings))
+    assert events.with_resets(found, stop) is expected
