@@ -73,9 +73,9 @@ class DensificationEvents:
     def with_resets(self, found: bool, stop: int) -> bool:
         """Whether steps must be as in a phase with opacity resets.
 
-        Two kinds of trainers without resets would end with too many Gaussians. If events clear moments, FastGS has
-        126 % of its own run's on fern. If Gaussians are selected by importance long after the last event,
-        Mini-Splatting has 145 %.
+        Two kinds of trainers without resets would end with too many Gaussians. If Gaussians are selected by importance
+        long after the last event, Mini-Splatting has 145 instead of 119 % of its own run's on fern. If events clear
+        moments, FastGS has 123 instead of 119 % on bonsai, with .005 less SSIM.
 
         Args:
             found: Whether a reset in the phase is known.
