@@ -138,9 +138,10 @@ class SkipGate:
                 longer steps. None if they are unknown.
 
         Raises:
-            SkipGSError: `numbers` is not a range with step 1. Before training has begun, the gate also raises it if
-                `numbers` goes beyond the plan of an earlier call, or if a condition of the loop cannot be evaluated
-                in advance and `always` is not given. During training, these two problems release the gate.
+            SkipGSError: `numbers` is not a range with step 1, or `resets` comes without `events`. Before training has
+                begun, the gate also raises it if `numbers` goes beyond the plan of an earlier call, or if a condition
+                of the loop cannot be evaluated in advance and `always` is not given. During training, these two
+                problems release the gate.
 
         Examples:
             Four of ten iterations run after densification, which ends here at iteration 10. The last one always runs.
