@@ -29,8 +29,8 @@ CHANGES = (
 )
 # Further methods of a strategy, and functions, that change no parameters: noise is left out with the gradient step.
 KNOWN = ("check_sanity", "initialize_state", "inject_noise_to_position")
-Resets = Callable[[int], bool]
 STAGES = ("step_pre_backward", "step_post_backward", "_update_state")
+Resets = Callable[[int], bool]
 
 
 def survey_of(adapter: Adapter, strategy: Any, *owners: Any, through: Iterable[str] = ()) -> Survey:
@@ -125,19 +125,19 @@ def _reset_condition(method: FunctionType | None) -> Callable[[Any, int], bool] 
     `step % self.reset_every == (0 & step) > 0`. So it never resets opacities.
     """
     syntax = None if method is None else syntax_of(method)
-    tests = (
-        [] if syntax is None else [test for test in ast.walk(syntax) if isinstance(test, ast.If) and _resets_in(test)]
-    )
-    parts = [part for test in tests for part in ast.walk(test.test)]
+    if syntax is None:
+        return None
+    tests = [node.test for node in ast.walk(syntax) if isinstance(node, ast.If) and _resets_in(node)]
+    parts = [part for test in tests for part in ast.walk(test)]
     names = {part.id for part in parts if isinstance(part, ast.Name)}
     if not tests or not names <= {"self", "step"} or any(isinstance(part, ast.Call) for part in parts):
         return None
-    return eval(f"lambda self, step: {' and '.join(f'({ast.unparse(test.test)})' for test in tests)}")
+    return eval(f"lambda self, step: {' and '.join(f'({ast.unparse(test)})' for test in tests)}")
 
 
-def _resets_in(test: ast.If) -> bool:
+def _resets_in(branch: ast.If) -> bool:
     """Whether a branch resets opacities."""
-    calls = (part for line in test.body for part in ast.walk(line) if isinstance(part, ast.Call))
+    calls = (part for line in branch.body for part in ast.walk(line) if isinstance(part, ast.Call))
     return any(isinstance(call.func, ast.Name) and call.func.id == "reset_opa" for call in calls)
 
 

@@ -285,8 +285,7 @@ class Growing(Phase):
         if self._auto:
             longer = self._config.compensates and self._visible is not None
             events = len(self.events) if self.events.all_run else 0
-            resets = self._resets or not self.events.resets  # MCMC's regulariser acts like resets
-            self.share = growing_share(self._length, self._epoch, longer, events, self._fading, resets)
+            self.share = growing_share(self._length, self._epoch, longer, events, self._fading, self._opacities_recover)
 
     def _warn_of_fading(self) -> None:
         """Warn if the share that the user gave is too small for a scene of random points."""
@@ -313,13 +312,13 @@ class Growing(Phase):
         # A reset takes random points away. Without one, long steps would make them large, and they would stay.
         stay = self._fading and self._reset is None
         positions = 1.0 if stay else positions_part(factor, events.resets)
-        return factor, GrowingParts(
-            self._opacity_factor(events, share), positions, events.clears_moments, scales_stay=stay
-        )
+        opacities = opacity_factor(share) if self._fading or self._opacities_recover else 1.0
+        return factor, GrowingParts(opacities, positions, events.clears_moments, scales_stay=stay)
 
-    def _opacity_factor(self, events: DensificationEvents, share: float) -> float:
-        """Return the factor on the rate of opacities: they recover from resets or MCMC's regulariser, or must fade."""
-        return opacity_factor(share) if self._resets or self._fading or not events.resets else 1.0
+    @property
+    def _opacities_recover(self) -> bool:
+        """Whether opacities must recover, from resets or from MCMC's regulariser."""
+        return self._resets or (self.events is not None and not self.events.resets)
 
     @property
     def _times_grown(self) -> float | None:
