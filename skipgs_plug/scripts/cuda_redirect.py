@@ -1,16 +1,19 @@
 """Run code for CUDA on the CPU: every request for a CUDA tensor gives a CPU tensor.
 
 Together with `compat`, this module runs an unmodified training script on a machine without a GPU. It emulates only
-placement and clocks. Everything else (streams, graphs, CUDA generators) fails as in any PyTorch without CUDA.
+placement, clocks, and facts about the device. Everything else (streams, graphs, CUDA generators) fails as in any
+PyTorch without CUDA.
 """
 
 from __future__ import annotations
 
 import functools
 import importlib
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -19,6 +22,9 @@ from torch.overrides import TorchFunctionMode
 from skipgs_plug.compat.child_processes import also_in_children
 from skipgs_plug.compat.stand_ins import stand_ins
 from skipgs_plug.scripts.threads import also_in_threads
+from skipgs_plug.trainer.free_memory import free_memory
+
+DEVICE_NAME = "CPU"
 
 
 class HostEvent:
@@ -53,16 +59,31 @@ def _nothing(*args: Any, **kwargs: Any) -> None:
     """Do nothing. Replaces calls that matter only on a GPU."""
 
 
+def _properties(device: Any = None) -> SimpleNamespace:
+    """Return the fields of `torch.cuda.get_device_properties` that scripts print or decide by."""
+    cores = os.cpu_count() or 1
+    return SimpleNamespace(name=DEVICE_NAME, major=0, minor=0, total_memory=free_memory(), multi_processor_count=cores)
+
+
 # Names that `cuda_on_cpu` replaces, and restores on exit.
 REPLACED: dict[str, Any] = {
     "torch.cuda.Event": HostEvent,
     "torch.cuda.synchronize": _nothing,
     "torch.cuda.set_device": _nothing,
     "torch.cuda.reset_peak_memory_stats": _nothing,
+    "torch.cuda.reset_max_memory_allocated": _nothing,
+    "torch.cuda.set_per_process_memory_fraction": _nothing,
+    "torch.cuda.ipc_collect": _nothing,
     "torch.cuda.current_device": lambda: 0,
     # Scripts assert that a device is available, and count devices to start one process for each.
     "torch.cuda.is_available": lambda: True,
     "torch.cuda.device_count": lambda: 1,
+    # Scripts print these, name a run after them, or choose a precision or a size by them.
+    "torch.cuda.get_device_name": lambda device=None: DEVICE_NAME,
+    "torch.cuda.get_device_properties": _properties,
+    "torch.cuda.get_device_capability": lambda device=None: (0, 0),
+    "torch.cuda.mem_get_info": lambda device=None: (free_memory(), free_memory()),
+    "torch.cuda.memory_summary": lambda device=None, abbreviated=False: "",
     # `torch.autocast("cuda", torch.bfloat16)` asks this; on the CPU, it changes nothing.
     "torch.cuda.is_bf16_supported": lambda including_emulation=True: True,
     # Torch's optimizers call this when a device is available. A build with CUDA raises an error without a driver.

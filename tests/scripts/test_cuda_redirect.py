@@ -78,6 +78,17 @@ def test_device_calls_that_only_order_work_do_nothing():
         assert torch.cuda.current_device() == 0
 
 
+def test_questions_about_the_device_are_answered_for_the_cpu():
+    with cuda_on_cpu():
+        properties = torch.cuda.get_device_properties(0)
+        assert torch.cuda.get_device_name() == torch.cuda.get_device_name(0) == properties.name == "CPU"
+        assert torch.cuda.get_device_capability() == (properties.major, properties.minor) == (0, 0)
+        free, total = torch.cuda.mem_get_info(torch.device("cuda"))
+        assert free > 0 and total > 0 and properties.total_memory > 0
+        assert torch.cuda.memory_summary() == ""
+        torch.cuda.ipc_collect()
+
+
 def test_events_measure_the_host():
     with cuda_on_cpu():
         start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
