@@ -75,7 +75,8 @@ def predict(pilot: Pilot, config: TrainConfig, max_steps: int) -> Forecast:
     per_growing = mean(costs)
     per_refining = cost(grown)
     longer, resets = pilot.visible is not None, schedule.strategy == "mcmc" or reset_interval(schedule) < stop
-    growing = growing_share(stop, pilot.views, longer, fading=pilot.fading, resets=resets) * stop
+    shown = pilot.visible if pilot.fading else None
+    growing = growing_share(stop, pilot.views, longer, shown_of_random=shown, resets=resets) * stop
     left = max_steps - stop
     refining = refining_share(left, pilot.views, grown=stop) * left if left else 0.0
     more = grown - max(sample.gaussians for sample in pilot.samples)

@@ -285,12 +285,14 @@ class Growing(Phase):
         if self._auto:
             longer = self._config.compensates and self._visible is not None
             events = len(self.events) if self.events.all_run else 0
-            self.share = growing_share(self._length, self._epoch, longer, events, self._fading, self._opacities_recover)
+            shown = self._visible if self._fading else None
+            self.share = growing_share(self._length, self._epoch, longer, events, shown, self._opacities_recover)
 
     def _warn_of_fading(self) -> None:
         """Warn if the share that the user gave is too small for a scene of random points."""
         assert self.share is not None
-        run, enough = self.share * self._length, growing_share(self._length, self._epoch, longer=True, fading=True)
+        run = self.share * self._length
+        enough = growing_share(self._length, self._epoch, longer=True, shown_of_random=self._visible)
         if self._has_longer_steps and self.share < enough:
             enough = math.ceil(100 * enough) / 100
             caution(
