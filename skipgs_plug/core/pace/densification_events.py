@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from skipgs_plug.core.pace.needs import LEAST_GROWING_SHARE
@@ -31,6 +31,29 @@ POWER_OF_SHARE = 0.5
 # keeps all of them. An event at most doubles the number of Gaussians. With 7 or 8 of 13 events, scripts on bonsai at
 # 100x67 ended with half of their Gaussians and 0.011 less SSIM.
 LEAST_EVENTS = 16
+
+
+def sort_conditions(
+    conditions: Mapping[str, set[int]], numbers: range, densification: Densification
+) -> tuple[set[int], set[int], dict[str, set[int]]]:
+    """Return the iterations with a densification event, those with an opacity reset, and all but events by condition.
+
+    Args:
+        conditions: Iterations that conditions of the loop name, by condition.
+        numbers: Iterations of the phase, for a strategy object that decides by itself.
+        densification: How to recognise both.
+    """
+    events = set() if densification.numbers is None else set(densification.numbers(numbers))
+    resets = set() if densification.reset_numbers is None else set(densification.reset_numbers(numbers))
+    others: dict[str, set[int]] = {}
+    for condition, hits in conditions.items():
+        if any(mark in condition for mark in densification.reset_marks):
+            resets |= hits
+        if any(mark in condition for mark in densification.marks):
+            events |= hits
+        elif hits:
+            others[condition] = hits
+    return events, resets, others
 
 
 class DensificationEvents:

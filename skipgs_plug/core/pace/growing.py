@@ -8,9 +8,10 @@ from typing import Any
 from skipgs_plug.core import distributed
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.config import SkipConfig
-from skipgs_plug.core.pace.densification_events import DensificationEvents
+from skipgs_plug.core.pace.densification_events import DensificationEvents, sort_conditions
 from skipgs_plug.core.pace.half_size import HalfSize
 from skipgs_plug.core.pace.needs import (
+    HIGHEST_OPACITY_RATE,
     LAST_FACTOR,
     LEAST_GROWING_SHARE,
     MOST_RAISED_SHARE,
@@ -24,7 +25,7 @@ from skipgs_plug.core.pace.needs import (
     refining_share,
     share_factor,
 )
-from skipgs_plug.core.pace.parts import ONLY_HIGHER_BANDS, UNCHANGED, GrowingParts
+from skipgs_plug.core.pace.parts import GEOMETRY, ONLY_HIGHER_BANDS, UNCHANGED, GrowingParts
 from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.sampling import Sampling
@@ -100,21 +101,11 @@ class Growing(Phase):
             # The trainer's own refinement on accumulated gradients has few steps: 312 of 15,000 iterations in FastGS.
             # Densification is nearly all of the training then, so all of it runs.
             named = set(numbers)
-        marks = densification.marks
-        events = set() if densification.numbers is None else set(densification.numbers(numbers))
-        others: dict[str, set[int]] = {}
-        resets = set() if densification.reset_numbers is None else set(densification.reset_numbers(numbers))
-        for reason, hits in found.items():
-            if any(mark in reason for mark in densification.reset_marks):
-                resets |= hits
-            if any(mark in reason for mark in marks):
-                events |= hits
-            elif hits:
-                others[reason] = hits
+        events, resets, others = sort_conditions(found, numbers, densification)
         before, self.events = self._events_state, DensificationEvents(events, densification)
         if before is not None:
             self.events.load_state_dict(before)
-        if marks and not any(mark in reason for reason in found for mark in marks):
+        if densification.marks and not any(mark in reason for reason in found for mark in densification.marks):
             return False
         self.always = {**others, NAMED_FOR_TRAINER: named} if named else others
         # A condition can name the iteration of an event that is left out. The iteration runs all the same if the
@@ -141,9 +132,10 @@ class Growing(Phase):
         parts = range(self._first, end), range(end, numbers.stop)
         until, after = (len(self._must.intersection(part)) / max(len(part), 1) for part in parts)
         self._must_shares = until, after
-        if following <= 0 and self._auto:
-            last = last_part(len(numbers), None if self._reset is None else plan.last - self._reset)
-            self._whole_from = max(numbers.stop - last, self._first)
+        since = None if self._reset is None else plan.last - self._reset
+        last = last_part(plan.last + 1 - numbers.start, since)
+        if self._auto and (following <= 0 or (self._resets and following < last)):
+            self._whole_from = max(plan.last + 1 - last, self._first)
             self._must |= set(range(self._whole_from, numbers.stop))
         self._epoch = plan.epoch or self._epoch
         self.half_size.begin(plan)
@@ -310,12 +302,16 @@ class Growing(Phase):
         ends = number >= self._first + self._length  # whether only prunes and terms of the loss follow
         share = max(self._share_now or self.share, self._must_shares[ends])
         grown = self._times_grown
-        factor = growing_factor(self._length, share, self._visible, events.all_run, grown, self._resets)
+        refined = self._whole_from is None
+        factor = growing_factor(self._length, share, self._visible, events.all_run, grown, self._resets, refined)
         # A reset takes random points away. Without one, long steps would make them large, and they would stay.
         stay = self._fading and self._reset is None
         positions = 1.0 if stay else positions_part(factor, events.resets)
+        scales = 0.0 if stay else 1.0 if self._resets and not refined else GEOMETRY
         opacities = opacity_factor(share) if self._fading or self._opacities_recover else 1.0
-        return factor, GrowingParts(opacities, positions, events.clears_moments, scales_stay=stay)
+        if self._resets and not self._fading and self._steps_after == 0:
+            return factor, GrowingParts(opacities, positions, scales, True, HIGHEST_OPACITY_RATE)
+        return factor, GrowingParts(opacities, positions, scales, events.clears_moments)
 
     @property
     def _opacities_recover(self) -> bool:

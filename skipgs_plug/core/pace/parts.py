@@ -180,25 +180,38 @@ class ScaledGroup(NamedTuple):
 
 
 class GrowingParts(NamedTuple):
-    """How two kinds of parameters share in longer steps while the scene grows.
+    """How some kinds of parameters share in longer steps while the scene grows.
 
     Attributes:
         opacities: Multiple of their rate that opacities take, at least 1.
         positions: Multiple of the common factor that positions take.
+        scales: Multiple of the common factor that scales take; 0 if they keep their rate.
         opacities_remember: Whether opacities keep the trainer's beta2.
+        highest_opacity_rate: Learning rate that longer steps of opacities do not exceed.
         only_higher_bands: Whether no steps are longer but those of the colours' higher bands.
-        scales_stay: Whether scales keep their rate.
     """
 
     opacities: float
     positions: float
+    scales: float = GEOMETRY
     opacities_remember: bool = False
+    highest_opacity_rate: float = math.inf
     only_higher_bands: bool = False
-    scales_stay: bool = False
 
-    def keeps(self, info: GroupInfo) -> bool:
-        """Whether a group other than opacities keeps its rate."""
-        return (self.only_higher_bands and info.part != HIGHER_BANDS) or (self.scales_stay and info.named_scales)
+    def of(self, info: GroupInfo) -> float:
+        """Return the multiple of the common factor that a group other than opacities takes; 0 if it keeps its rate."""
+        assert info.part is not None
+        if self.only_higher_bands and info.part != HIGHER_BANDS:
+            return 0.0
+        if info.named_scales:
+            return self.scales
+        return self.positions if info.named_positions else info.part
+
+    def of_opacities(self, rate: float) -> float:
+        """Return the multiple of their learning rate `rate` that opacities take."""
+        if rate <= 0.0 or self.highest_opacity_rate == math.inf:
+            return self.opacities
+        return max(1.0, min(self.opacities, self.highest_opacity_rate / rate))
 
 
 UNCHANGED = GrowingParts(1.0, 1.0)  # with a factor of 1, the trainer's own steps
@@ -273,18 +286,18 @@ def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
     if not info.of_gaussians(rows):
         return ScaledGroup(info.group, OTHERS_AT_MOST, 1.0, None) if growing is None else None
     if info.part is None:
-        times = (1.0 if growing is None else growing.opacities) * _recovering(info.rate, opacity_rate)
+        times = (1.0 if growing is None else growing.of_opacities(info.rate)) * _recovering(info.rate, opacity_rate)
         if growing is None or times > 1.0 or (raised and not growing.only_higher_bands):
             remembers = growing is not None and growing.opacities_remember
             return ScaledGroup(info.group, times, 1.0, None if remembers else info)
         return None
-    if not raised or (growing is not None and growing.keeps(info)):
+    if not raised:
         return None
-    if not info.named_positions:
-        return ScaledGroup(info.group, info.part, math.inf, info)
-    if growing is not None:
-        return ScaledGroup(info.group, growing.positions, math.inf, info)
-    return ScaledGroup(info.group, info.part, math.inf, info, positions_rate)
+    part = info.part if growing is None else growing.of(info)
+    if part == 0.0:
+        return None
+    highest = positions_rate if growing is None and info.named_positions else math.inf
+    return ScaledGroup(info.group, part, math.inf, info, highest)
 
 
 def _recovering(rate: float, least: float) -> float:

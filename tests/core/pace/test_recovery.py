@@ -12,13 +12,14 @@ from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.pace.needs import (
     AVERAGING_VISITS,
     LONGEST_POSITIONS,
+    LONGEST_STEPS_WITHOUT_REFINEMENT,
     MOST_LAST,
     OPACITY_PATH,
     last_part,
     longest_positions,
     opacity_rate,
 )
-from skipgs_plug.core.pace.parts import MOST_OPACITY_FACTOR, rate_of_positions
+from skipgs_plug.core.pace.parts import MOST_OPACITY_FACTOR, GrowingParts, rate_of_positions
 from skipgs_plug.core.pace.phase import Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.refining import Refining
@@ -123,8 +124,8 @@ class Loop:
         self.optimizer = torch.optim.SGD([{"params": [value], "name": name} for name, value in values.items()], lr=1.0)
         self.steps = {}
 
-    def train(self, gate):
-        for step in gate.iterations(range(self.LAST), views=VIEWS, events=range(20, self.LAST, 20)):
+    def train(self, gate, resets=None):
+        for step in gate.iterations(range(self.LAST), views=VIEWS, events=range(20, self.LAST, 20), resets=resets):
             before = self.now
             loss = self.means.sum() - self.opacities.sum() + self.bands.sum()  # opacities rise
             if gate.backward(loss, view=VIEWS[step % 4], step=step):
@@ -155,3 +156,33 @@ def test_a_given_share_and_a_run_with_refinement_have_no_such_end():
         last = range(Loop.LAST - last_part(Loop.LAST, None), Loop.LAST)
         assert not set(last) <= loop.steps.keys()
         assert math.isfinite(loop.steps[max(loop.steps)][0])
+
+
+RESETS = range(150, Loop.LAST - 50, 150)  # the last one in iteration 1,800
+
+
+def test_steps_are_longer_if_no_refinement_follows_and_opacities_keep_a_rate_that_is_high_already():
+    with SkipGate(start_iter=5 * Loop.LAST, share="auto") as gate:
+        loop = Loop().train(gate, RESETS)
+    growing = gate.report()["growing"]
+    assert growing["rate_factor"] == LONGEST_STEPS_WITHOUT_REFINEMENT
+    assert growing["opacity_rate_factor"] > 1.0
+    earlier = [steps for number, steps in loop.steps.items() if 200 < number < RESETS[-1]]
+    assert all(steps == pytest.approx((4.0, -1.0, 16.0), rel=1e-4) for steps in earlier)
+
+
+@pytest.mark.parametrize(("resets", "whole"), [(RESETS, True), ([], False)])
+def test_all_iterations_after_the_last_reset_run_if_densification_ends_late(resets, whole):
+    start = Loop.LAST - 100
+    with SkipGate(start_iter=start, share="auto") as gate:
+        loop = Loop().train(gate, resets)
+    last = range(RESETS[-1], start)
+    assert (set(last) <= loop.steps.keys()) == whole
+    if whole:
+        assert all(loop.steps[step] == pytest.approx((1.0, -1.0, 8.0), rel=1e-4) for step in last)
+
+
+def test_longer_steps_of_opacities_have_a_highest_rate():
+    parts = GrowingParts(3.0, 1.0, highest_opacity_rate=0.05)
+    assert parts.of_opacities(0.01) == 3.0 and parts.of_opacities(0.025) == 2.0 and parts.of_opacities(0.1) == 1.0
+    assert parts.of_opacities(0.0) == 3.0  # a rate that a scheduler has yet to raise
