@@ -302,14 +302,15 @@ class Growing(Phase):
         ends = number >= self._first + self._length  # whether only prunes and terms of the loss follow
         share = max(self._share_now or self.share, self._must_shares[ends])
         grown = self._times_grown
-        refined = self._whole_from is None
-        factor = growing_factor(self._length, share, self._visible, events.all_run, grown, self._resets, refined)
-        # A reset takes random points away. Without one, long steps would make them large, and they would stay.
-        stay = self._fading and self._reset is None
-        positions = 1.0 if stay else positions_part(factor, events.resets)
-        scales = 0.0 if stay else 1.0 if self._resets and not refined else GEOMETRY
+        unrefined = self._whole_from is not None and self._resets
+        factor = growing_factor(self._length, share, self._visible, events.all_run, grown, self._resets, not unrefined)
         opacities = opacity_factor(share) if self._fading or self._opacities_recover else 1.0
-        if self._resets and not self._fading and self._steps_after == 0:
+        positions = positions_part(factor, far=not events.resets or (unrefined and not self._fading))
+        scales = 1.0 if unrefined else GEOMETRY
+        if self._fading and self._reset is None:
+            # A reset takes random points away. Without one, long steps would make them large, and they would stay.
+            positions, scales = 1.0, 0.0
+        if unrefined and not self._fading and not self._steps_after:
             return factor, GrowingParts(opacities, positions, scales, True, HIGHEST_OPACITY_RATE)
         return factor, GrowingParts(opacities, positions, scales, events.clears_moments)
 

@@ -6,7 +6,7 @@ import torch
 from skipgs_plug import SkipGate
 from skipgs_plug.core.caution import GateWarning
 from skipgs_plug.core.pace.fading import Fading
-from skipgs_plug.core.pace.needs import GROWING_SIGHTS_FROM_RANDOM, growing_share
+from skipgs_plug.core.pace.needs import GROWING_SIGHTS_FROM_RANDOM, GROWING_STEPS_FROM_RANDOM, growing_share
 
 ROWS, START, LAST = 40, 4000, 6000
 VIEWS = [f"{i}.png" for i in range(4)]
@@ -49,7 +49,7 @@ def test_nothing_is_kept_after_the_answer():
 
 
 def test_a_scene_of_random_points_needs_more_iterations():
-    assert growing_share(3500, 100, longer=True, shown_of_random=1.0) == GROWING_SIGHTS_FROM_RANDOM / 3500
+    assert growing_share(3500, 100, longer=True, shown_of_random=1.0) == GROWING_STEPS_FROM_RANDOM / 3500
     assert growing_share(1500, 17, longer=True, shown_of_random=1.0) == 1.0
     seldom_shown = growing_share(15_000, 255, longer=True, shown_of_random=0.2)
     assert seldom_shown == pytest.approx(5 * GROWING_SIGHTS_FROM_RANDOM / 15_000)
@@ -84,9 +84,9 @@ def test_with_auto_the_first_steps_decide(direction):
         ran = train(gate, direction)
     growing = gate.report()["growing"]
     assert growing["fading"] == (direction < 0)
-    least = GROWING_SIGHTS_FROM_RANDOM if direction < 0 else 0
+    least = GROWING_STEPS_FROM_RANDOM if direction < 0 else 0
     assert ran == growing["iterations_run"] >= least
-    assert (growing["share"] == GROWING_SIGHTS_FROM_RANDOM / START) == (direction < 0)
+    assert (growing["share"] == GROWING_STEPS_FROM_RANDOM / START) == (direction < 0)
     assert ("random" in gate.summary()) == (direction < 0)
 
 
@@ -103,7 +103,7 @@ def test_a_state_keeps_the_answer():
 def test_a_share_that_is_too_small_for_random_points_is_warned_of(share, compensate, warned):
     with SkipGate(start_iter=START, share=share, compensate=compensate) as gate:
         if warned:
-            with pytest.warns(GateWarning, match=r"grow_share=0\.42 or"):
+            with pytest.warns(GateWarning, match=r"grow_share=0\.44 or"):
                 train(gate, -1, until=100)
         else:
             train(gate, -1, until=100)
@@ -119,5 +119,5 @@ def test_scales_keep_their_rate_and_positions_take_the_common_factor():
         train(gate, -1, until=500, note=note)
     factor = gate.report()["growing"]["rate_factor"]
     assert factor > 1.0
-    opacities = (START / GROWING_SIGHTS_FROM_RANDOM) ** 0.5
+    opacities = (START / GROWING_STEPS_FROM_RANDOM) ** 0.5
     assert rates[-1] == pytest.approx([factor, opacities, 1.0])

@@ -309,7 +309,7 @@ def test_steps_conserve_the_path_in_any_schedule_if_opacities_are_never_reset():
     assert growing_factor(25_000, 0.2, 1 / 3, by_budget=True, resets=False) == pytest.approx(5.0)
     assert growing_factor(25_000, 0.1, 0.96, by_budget=True, resets=False) == 8.0  # the longest that pay
     assert growing_factor(25_000, 0.9, 1 / 3, by_budget=True, resets=False) == pytest.approx(1 / 0.9)
-    assert positions_part(3.0, resets=False) == 2.0 and positions_part(8.0, resets=False) == 1.0
+    assert positions_part(3.0, far=True) == 2.0 and positions_part(8.0, far=True) == 1.0
     assert growing_factor(25_000, 0.1, 0.96, resets=False) == 5.0  # there, the number of Gaussians rises with them
 
 

@@ -168,7 +168,7 @@ def test_steps_are_longer_if_no_refinement_follows_and_opacities_keep_a_rate_tha
     assert growing["rate_factor"] == LONGEST_STEPS_WITHOUT_REFINEMENT
     assert growing["opacity_rate_factor"] > 1.0
     earlier = [steps for number, steps in loop.steps.items() if 200 < number < RESETS[-1]]
-    assert all(steps == pytest.approx((4.0, -1.0, 16.0), rel=1e-4) for steps in earlier)
+    assert all(steps == pytest.approx((8.0, -1.0, 16.0), rel=1e-4) for steps in earlier)
 
 
 @pytest.mark.parametrize(("resets", "whole"), [(RESETS, True), ([], False)])
