@@ -14,14 +14,17 @@ from skipgs_plug.core.pace.needs import (
     HIGHEST_OPACITY_RATE,
     LAST_FACTOR,
     LEAST_GROWING_SHARE,
+    LONGEST_STEPS_OF_POSITIONS,
+    LONGEST_STEPS_OF_POSITIONS_THAT_STAY,
+    LONGEST_STEPS_OF_SCALES,
     MOST_RAISED_SHARE,
     for_new_gaussians,
+    geometry_part,
     growing_factor,
     growing_share,
     last_part,
     opacity_factor,
     opacity_rate,
-    positions_part,
     refining_share,
     share_factor,
 )
@@ -132,9 +135,8 @@ class Growing(Phase):
         parts = range(self._first, end), range(end, numbers.stop)
         until, after = (len(self._must.intersection(part)) / max(len(part), 1) for part in parts)
         self._must_shares = until, after
-        since = None if self._reset is None else plan.last - self._reset
-        last = last_part(plan.last + 1 - numbers.start, since)
-        if self._auto and (following <= 0 or (self._resets and following < last)):
+        last = last_part(plan.last + 1 - numbers.start, None if self._reset is None else plan.last - self._reset)
+        if self._auto and (following <= 0 or (self._reset is not None and following < last)):
             self._whole_from = max(plan.last + 1 - last, self._first)
             self._must |= set(range(self._whole_from, numbers.stop))
         self._epoch = plan.epoch or self._epoch
@@ -302,14 +304,16 @@ class Growing(Phase):
         ends = number >= self._first + self._length  # whether only prunes and terms of the loss follow
         share = max(self._share_now or self.share, self._must_shares[ends])
         grown = self._times_grown
-        unrefined = self._whole_from is not None and self._resets
+        reset = self._reset is not None
+        unrefined = reset and self._whole_from is not None
         factor = growing_factor(self._length, share, self._visible, events.all_run, grown, self._resets, not unrefined)
         opacities = opacity_factor(share) if self._fading or self._opacities_recover else 1.0
-        positions = positions_part(factor, far=not events.resets or (unrefined and not self._fading))
-        scales = 1.0 if unrefined else GEOMETRY
-        if self._fading and self._reset is None:
+        if self._fading and not reset:
             # A reset takes random points away. Without one, long steps would make them large, and they would stay.
-            positions, scales = 1.0, 0.0
+            return factor, GrowingParts(opacities, 1.0, 0.0, events.clears_moments)
+        scales = geometry_part(factor, LONGEST_STEPS_OF_SCALES) if reset else GEOMETRY
+        far = (reset and not self._fading) or not events.resets
+        positions = geometry_part(factor, LONGEST_STEPS_OF_POSITIONS if far else LONGEST_STEPS_OF_POSITIONS_THAT_STAY)
         if unrefined and not self._fading and not self._steps_after:
             return factor, GrowingParts(opacities, positions, scales, True, HIGHEST_OPACITY_RATE)
         return factor, GrowingParts(opacities, positions, scales, events.clears_moments)

@@ -6,10 +6,10 @@ import pytest
 
 from skipgs_plug.core.pace.needs import (
     for_new_gaussians,
+    geometry_part,
     growing_factor,
     growing_share,
     opacity_factor,
-    positions_part,
     refining_share,
     share_factor,
 )
@@ -61,4 +61,5 @@ def test_factors_while_the_scene_grows():
     assert growing_factor(15_000, 0.2, 0.96, times_grown=math.e**1.5) == pytest.approx((1.5 * 2100 / 3000) ** 2)
     assert growing_factor(15_000, 0.2, 0.96, times_grown=12.0) == pytest.approx((2 * 2100 / 3000) ** 2)
     assert opacity_factor(0.25) == 2.0 and opacity_factor(1.0) == 1.0
-    assert positions_part(3.0) == pytest.approx(4 / 3) and positions_part(1.5) == 2.0 and positions_part(4.0) == 1.0
+    assert geometry_part(3.0, 4.0) == pytest.approx(4 / 3)
+    assert geometry_part(1.5, 4.0) == geometry_part(3.0, 8.0) == 2.0 and geometry_part(5.0, 4.0) == 1.0
