@@ -84,6 +84,7 @@ class Growing(Phase):
         self._reset: int | None = None  # iteration of the last opacity reset; None without one, or if it is unknown
         self._resets = True  # whether opacities are reset in this phase, or it is not known
         self._whole_from: int | None = None  # iteration from which all run, because no refinement follows
+        self._unrefined = False  # whether the run ends before it makes up for the growing phase
         self._end = self._steps_after = 0  # end of the phase, and number of iterations that will run in the following
         self._saved_events: dict[str, Any] | None = None
 
@@ -135,8 +136,11 @@ class Growing(Phase):
         parts = range(self._first, end), range(end, numbers.stop)
         until, after = (len(self._must.intersection(part)) / max(len(part), 1) for part in parts)
         self._must_shares = until, after
-        last = last_part(plan.last + 1 - numbers.start, None if self._reset is None else plan.last - self._reset)
-        if self._auto and (following <= 0 or (self._reset is not None and following < last)):
+        since = None if self._reset is None else plan.last - self._reset
+        last = last_part(plan.last + 1 - numbers.start, since)
+        cut = following <= 0
+        self._unrefined = self._auto and since is not None and (since <= last or (cut and end == numbers.stop))
+        if self._unrefined or (self._auto and cut):
             self._whole_from = max(plan.last + 1 - last, self._first)
             self._must |= set(range(self._whole_from, numbers.stop))
         self._epoch = plan.epoch or self._epoch
@@ -247,8 +251,8 @@ class Growing(Phase):
         assert self.events is not None and self.share is not None
         # The ray-traced scene, which grows to e times as many Gaussians at most, needs more iterations per event with a
         # larger share. Scenes that grow more do not.
-        grows_strongly = self._auto and self._grows_strongly
-        return self.events.needed(number, self._visible_now, self.share, self._length, grows_strongly)
+        strongly = self._auto and self._grows_strongly
+        return self.events.needed(number, self._visible_now, self.share, self._length, strongly)
 
     @property
     def _grows_strongly(self) -> bool:
@@ -285,14 +289,12 @@ class Growing(Phase):
     def _warn_of_fading(self) -> None:
         """Warn if the share that the user gave is too small for a scene of random points."""
         assert self.share is not None
-        run = self.share * self._length
         enough = growing_share(self._length, self._epoch, longer=True, shown_of_random=self._visible)
         if self._has_longer_steps and self.share < enough:
-            enough = math.ceil(100 * enough) / 100
             caution(
                 f"The points that the scene began with fade, as random ones do. With a share of {self.share:g}, "
-                f"{run:,.0f} iterations run until densification ends, and such points can stay as haze: give "
-                f'grow_share={enough:g} or "auto".'
+                f"{self.share * self._length:,.0f} iterations run until densification ends, and such points can stay "
+                f'as haze: give grow_share={math.ceil(100 * enough) / 100:g} or "auto".'
             )
 
     def _factors(self, number: int) -> tuple[float, GrowingParts]:
@@ -303,18 +305,16 @@ class Growing(Phase):
         assert self._first is not None
         ends = number >= self._first + self._length  # whether only prunes and terms of the loss follow
         share = max(self._share_now or self.share, self._must_shares[ends])
-        grown = self._times_grown
-        reset = self._reset is not None
-        unrefined = reset and self._whole_from is not None
-        factor = growing_factor(self._length, share, self._visible, events.all_run, grown, self._resets, not unrefined)
+        grown, refined = self._times_grown, not self._unrefined
+        factor = growing_factor(self._length, share, self._visible, events.all_run, grown, self._resets, refined)
         opacities = opacity_factor(share) if self._fading or self._opacities_recover else 1.0
-        if self._fading and not reset:
+        if self._fading and self._reset is None:
             # A reset takes random points away. Without one, long steps would make them large, and they would stay.
             return factor, GrowingParts(opacities, 1.0, 0.0, events.clears_moments)
-        scales = geometry_part(factor, LONGEST_STEPS_OF_SCALES) if reset else GEOMETRY
-        far = (reset and not self._fading) or not events.resets
+        scales = GEOMETRY if self._reset is None else geometry_part(factor, LONGEST_STEPS_OF_SCALES)
+        far = (self._reset is not None and not self._fading) or not events.resets
         positions = geometry_part(factor, LONGEST_STEPS_OF_POSITIONS if far else LONGEST_STEPS_OF_POSITIONS_THAT_STAY)
-        if unrefined and not self._fading and not self._steps_after:
+        if self._unrefined and not self._fading and not self._steps_after:
             return factor, GrowingParts(opacities, positions, scales, True, HIGHEST_OPACITY_RATE)
         return factor, GrowingParts(opacities, positions, scales, events.clears_moments)
 

@@ -124,8 +124,8 @@ class Loop:
         self.optimizer = torch.optim.SGD([{"params": [value], "name": name} for name, value in values.items()], lr=1.0)
         self.steps = {}
 
-    def train(self, gate, resets=None):
-        for step in gate.iterations(range(self.LAST), views=VIEWS, events=range(20, self.LAST, 20), resets=resets):
+    def train(self, gate, resets=None, events=range(20, LAST, 20)):
+        for step in gate.iterations(range(self.LAST), views=VIEWS, events=events, resets=resets):
             before = self.now
             loss = self.means.sum() - self.opacities.sum() + self.bands.sum()  # opacities rise
             if gate.backward(loss, view=VIEWS[step % 4], step=step):
@@ -180,6 +180,15 @@ def test_all_iterations_after_the_last_reset_run_if_densification_ends_late(rese
     assert (set(last) <= loop.steps.keys()) == whole
     if whole:
         assert all(loop.steps[step] == pytest.approx((1.0, -1.0, 8.0), rel=1e-4) for step in last)
+
+
+def test_a_run_that_goes_on_long_after_its_last_event_and_reset_is_refined_in_that_time():
+    events, resets = range(20, 1000, 20), range(150, 1000, 150)
+    with SkipGate(start_iter=Loop.LAST - 50, share="auto") as gate:  # it prunes in iteration 1,950, such as GaussianSpa
+        loop = Loop()
+        loop.train(gate, resets, events)
+    assert gate.report()["growing"]["rate_factor"] < LONGEST_STEPS_WITHOUT_REFINEMENT
+    assert not set(range(Loop.LAST - 200, Loop.LAST - 50)) <= loop.steps.keys()
 
 
 def test_longer_steps_of_opacities_have_a_highest_rate():
