@@ -136,11 +136,10 @@ class Growing(Phase):
         parts = range(self._first, end), range(end, numbers.stop)
         until, after = (len(self._must.intersection(part)) / max(len(part), 1) for part in parts)
         self._must_shares = until, after
-        since = None if self._reset is None else plan.last - self._reset
-        last = last_part(plan.last + 1 - numbers.start, since)
-        cut = following <= 0
-        self._unrefined = self._auto and since is not None and (since <= last or (cut and end == numbers.stop))
-        if self._unrefined or (self._auto and cut):
+        last = last_part(plan.last + 1 - numbers.start, None if self._reset is None else plan.last - self._reset)
+        grows = self._reset is not None and end == numbers.stop  # it resets opacities, and its events go on to the end
+        self._unrefined = self._auto and grows and following < last
+        if self._unrefined or (self._auto and following <= 0):
             self._whole_from = max(plan.last + 1 - last, self._first)
             self._must |= set(range(self._whole_from, numbers.stop))
         self._epoch = plan.epoch or self._epoch
