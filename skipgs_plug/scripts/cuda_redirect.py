@@ -82,7 +82,7 @@ REPLACED: dict[str, Any] = {
     "torch.cuda.get_device_name": lambda device=None: DEVICE_NAME,
     "torch.cuda.get_device_properties": _properties,
     "torch.cuda.get_device_capability": lambda device=None: (0, 0),
-    "torch.cuda.mem_get_info": lambda device=None: (free_memory(), free_memory()),
+    "torch.cuda.mem_get_info": lambda device=None: (free_memory(),) * 2,  # free and total
     "torch.cuda.memory_summary": lambda device=None, abbreviated=False: "",
     # `torch.autocast("cuda", torch.bfloat16)` asks this; on the CPU, it changes nothing.
     "torch.cuda.is_bf16_supported": lambda including_emulation=True: True,

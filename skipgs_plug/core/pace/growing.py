@@ -83,7 +83,7 @@ class Growing(Phase):
         self._fading = False  # whether the points that the scene began with faded
         self._reset: int | None = None  # iteration of the last opacity reset; None without one, or if it is unknown
         self._resets = True  # whether opacities are reset in this phase, or it is not known
-        self._whole_from: int | None = None  # iteration from which all run, because no refinement follows
+        self._whole_from: int | None = None  # iteration from which all run, if no or hardly any refinement follows
         self._unrefined = False  # whether the run ends before it makes up for the growing phase
         self._end = self._steps_after = 0  # end of the phase, and number of iterations that will run in the following
         self._saved_events: dict[str, Any] | None = None
@@ -250,8 +250,8 @@ class Growing(Phase):
         assert self.events is not None and self.share is not None
         # The ray-traced scene, which grows to e times as many Gaussians at most, needs more iterations per event with a
         # larger share. Scenes that grow more do not.
-        strongly = self._auto and self._grows_strongly
-        return self.events.needed(number, self._visible_now, self.share, self._length, strongly)
+        grows_strongly = self._auto and self._grows_strongly
+        return self.events.needed(number, self._visible_now, self.share, self._length, grows_strongly)
 
     @property
     def _grows_strongly(self) -> bool:

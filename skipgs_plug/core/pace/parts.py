@@ -209,9 +209,7 @@ class GrowingParts(NamedTuple):
 
     def of_opacities(self, rate: float) -> float:
         """Return the multiple of their learning rate `rate` that opacities take."""
-        if rate <= 0.0 or self.highest_opacity_rate == math.inf:
-            return self.opacities
-        return max(1.0, min(self.opacities, self.highest_opacity_rate / rate))
+        return max(1.0, min(self.opacities, self.highest_opacity_rate / rate)) if rate > 0.0 else self.opacities
 
 
 UNCHANGED = GrowingParts(1.0, 1.0)  # with a factor of 1, the trainer's own steps
@@ -286,7 +284,8 @@ def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
     if not info.of_gaussians(rows):
         return ScaledGroup(info.group, OTHERS_AT_MOST, 1.0, None) if growing is None else None
     if info.part is None:
-        times = (1.0 if growing is None else growing.of_opacities(info.rate)) * _recovering(info.rate, opacity_rate)
+        rate = info.rate
+        times = (1.0 if growing is None else growing.of_opacities(rate)) * _recovering(rate, opacity_rate)
         if growing is None or times > 1.0 or (raised and not growing.only_higher_bands):
             remembers = growing is not None and growing.opacities_remember
             return ScaledGroup(info.group, times, 1.0, None if remembers else info)

@@ -10,10 +10,7 @@ import torch
 from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.core.pace import needs
 from skipgs_plug.core.pace.densification_events import LEAST_EVENTS
-from skipgs_plug.core.pace.needs import (
-    for_new_gaussians,
-    growing_factor,
-)
+from skipgs_plug.core.pace.needs import for_new_gaussians, growing_factor
 
 VIEWS = [f"{i}.png" for i in range(4)]
 INTERVAL, START, LAST = 20, 400, 600
