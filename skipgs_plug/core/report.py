@@ -180,10 +180,10 @@ def _fading(growing: dict[str, Any]) -> str:
 
 def _half_size(growing: dict[str, Any]) -> str:
     """Return a line about photographs of half the size; empty if there were none."""
-    until, psnr = growing["half_size_until"], growing["half_size_psnr"]
+    until, psnr, ssim = (growing[f"half_size_{key}"] for key in ("until", "psnr", "ssim"))
     if not until:
         return ""
-    kept = "" if psnr is None else f", because they keep {psnr:.1f} dB at that size"
+    kept = "" if psnr is None else f", because they keep {psnr:.1f} dB and an SSIM of {ssim:.3f} at that size"
     return f"\n  photographs had half their size until iteration {until:,}{kept}"
 
 

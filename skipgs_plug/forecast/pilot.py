@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from skipgs_plug import SkipGate
 from skipgs_plug.bench.memory import memory_meter
-from skipgs_plug.core.half_size import half_size_psnr, in_unit_range, keep_detail, some_of
+from skipgs_plug.core.half_size import in_unit_range, kept_at_half_size, some_of
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.loop import Iteration
 
@@ -90,7 +90,7 @@ def run_pilot(
         report = gate.report()
     peak = None if meter is None else meter.peak()
     photographs = (in_unit_range(scene.train[i].image) for i in some_of(len(scene.train)))  # one at a time in memory
-    halves = keep_detail(half_size_psnr(photographs))
+    halves = kept_at_half_size(photographs).enough
     fading = bool(report["growing"] and report["growing"]["fading"])
     visible, views = report["gaussians_shown"], len(scene.train)
     return Pilot(tuple(samples), first, views, visible, trainer.refine_stop_iter, halves, peak, fading)

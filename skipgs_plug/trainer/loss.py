@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from skipgs_plug.trainer.ssim import C1, C2, RADIUS, SIGMA
+from skipgs_plug.core.ssim import C1, C2, RADIUS, SIGMA
 
 WINDOW = 2 * RADIUS + 1  # pixels along each side of SSIM's window
 

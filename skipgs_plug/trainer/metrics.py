@@ -12,10 +12,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from skipgs_plug.core.ssim import ssim_map
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.exposure import fit_colours
 from skipgs_plug.trainer.mask import leave_out
-from skipgs_plug.trainer.ssim import ssim_map
 
 SSIM_FLAVOUR = "torchmetrics 1.9: 11x11 Gaussian window, borders reflected, mean over all windows"
 LEAST_ERROR = 1e-10  # smallest mean squared error of an image, so that PSNR is at most 100 dB, not infinite

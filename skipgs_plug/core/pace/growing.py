@@ -337,8 +337,7 @@ class Growing(Phase):
 
         `share`, `iterations_run`, `iterations_skipped`, `events_run`, `events_skipped`, `rate_factor`,
         `opacity_rate_factor`, `times_grown` (Gaussians at the last event, as a multiple of those at the first; None if
-        unknown), `fading` (whether the points that the scene began with faded), `half_size_until` (iteration before
-        which photographs had half their size; 0 for none), `half_size_psnr` (decibels; None if it did not decide),
+        unknown), `fading` (whether the points that the scene began with faded), those of `HalfSize.report`, and
         `always_run`.
         """
         if self._first is None:
@@ -356,8 +355,7 @@ class Growing(Phase):
             "opacity_rate_factor": None if parts is None else parts.opacities,
             "times_grown": self._times_grown,
             "fading": self._fading,
-            "half_size_until": self.half_size.until,
-            "half_size_psnr": self.half_size.psnr,
+            **self.half_size.report(),
             "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
         }
 

@@ -9,7 +9,7 @@ import torch
 from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.half_size import half_size_psnr, keep_detail
+from skipgs_plug.core.half_size import Kept, kept_at_half_size
 from skipgs_plug.core.pace.phase import PhasePlan
 
 
@@ -21,13 +21,13 @@ class HalfSize:
 
     Attributes:
         until: The iteration; 0 if they never have; None before `begin`.
-        psnr: PSNR of these photographs against their own size, in decibels; None if it did not decide.
+        kept: What photographs keep at that size; None if it did not decide.
     """
 
     def __init__(self, config: SkipConfig) -> None:
         self._config = config
         self.until: int | None = None
-        self.psnr: float | None = None
+        self.kept: Kept | None = None
 
     def begin(self, plan: PhasePlan) -> None:
         """Decide, unless a saved state did. All processes must call it together.
@@ -48,9 +48,8 @@ class HalfSize:
             return False
         if not self._config.may_halve or self._config.half_size:
             return self._config.may_halve
-        own = torch.tensor([half_size_psnr(plan.photographs())])
-        (self.psnr,) = distributed.mean(own)
-        return keep_detail(self.psnr)
+        self.kept = Kept(*distributed.mean(torch.tensor(kept_at_half_size(plan.photographs()))))
+        return self.kept.enough
 
     def holds(self, number: int) -> bool:
         """Return whether iteration `number` trains on a photograph of half the size."""
@@ -60,8 +59,18 @@ class HalfSize:
         """Give photographs their own size from iteration `number` on."""
         self.until = min(self.until or 0, number)
 
+    def report(self) -> dict[str, Any]:
+        """Return the entries of skipgs.json about such photographs.
+
+        `half_size_until` (iteration before which photographs had half their size; 0 for none), `half_size_psnr`
+        (decibels) and `half_size_ssim` (what they keep at that size; None if it did not decide).
+        """
+        psnr, ssim = self.kept or (None, None)
+        return {"half_size_until": self.until, "half_size_psnr": psnr, "half_size_ssim": ssim}
+
     def state_dict(self) -> list[Any]:
-        return [self.until, self.psnr]
+        return [self.until, None if self.kept is None else list(self.kept)]
 
     def load_state_dict(self, state: list[Any]) -> None:
-        self.until, self.psnr = state
+        self.until, kept = state
+        self.kept = Kept(*kept) if isinstance(kept, list) else None  # older states have the PSNR alone

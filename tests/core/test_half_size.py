@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from skipgs_plug.core.half_size import JUDGED, can_be_halved, half_size_psnr, halved, some_of
+from skipgs_plug.core.half_size import JUDGED, Kept, can_be_halved, halved, kept_at_half_size, some_of
 
 
 def test_each_value_is_the_mean_of_four():
@@ -36,11 +36,18 @@ def test_half_the_size_must_hold_the_window_of_ssim(size, possible):
 def test_photographs_with_fine_detail_lose_more():
     stripes = (torch.arange(64) % 2).float().expand(3, 64, 64)  # half the size is grey
     smooth = torch.linspace(0, 1, 64).expand(3, 64, 64)
-    assert half_size_psnr([stripes]) == pytest.approx(-10 * math.log10(0.25), abs=1e-3)
-    assert half_size_psnr([smooth]) > 45
-    mean = (half_size_psnr([smooth]) + half_size_psnr([stripes])) / 2
-    assert half_size_psnr([smooth, stripes]) == pytest.approx(mean)
-    assert math.isfinite(half_size_psnr([torch.zeros(3, 30, 30)]))
+    fine, plain, both = (kept_at_half_size(images) for images in ([stripes], [smooth], [smooth, stripes]))
+    assert fine.psnr == pytest.approx(-10 * math.log10(0.25), abs=1e-3) and fine.ssim < 0.1
+    assert plain.psnr > 45 and plain.ssim > 0.99
+    assert both == pytest.approx([(fine.psnr + plain.psnr) / 2, (fine.ssim + plain.ssim) / 2])
+    assert math.isfinite(kept_at_half_size([torch.zeros(3, 30, 30)]).psnr)
+
+
+def test_large_plain_areas_do_not_hide_lost_detail():
+    texture = torch.rand(3, 96, 96, generator=torch.Generator().manual_seed(0)) * 0.09  # a faint one: its PSNR is high
+    kept = kept_at_half_size([texture])
+    assert kept.psnr > 32 and kept.ssim < 0.9 and not kept.enough
+    assert Kept(33.0, 0.95).enough and not Kept(31.0, 0.95).enough
 
 
 def test_the_photographs_that_decide_are_spread_over_all():

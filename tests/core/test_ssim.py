@@ -6,9 +6,9 @@ import pytest
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from skipgs_plug.trainer import ssim as ssim_module
+from skipgs_plug.core import ssim as ssim_module
+from skipgs_plug.core.ssim import ssim_map
 from skipgs_plug.trainer.metrics import batch, ssim
-from skipgs_plug.trainer.ssim import ssim_map
 
 
 @pytest.mark.parametrize(("height", "width"), [(11, 11), (40, 57), (64, 200)])
