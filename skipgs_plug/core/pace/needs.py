@@ -106,8 +106,8 @@ LAST_FACTOR = 2.0
 # Largest rate of positions, as a multiple of their first one, if each view comes up `AVERAGING_VISITS` times at most.
 # Most trainers have lowered the rate to a tenth by then, so that steps are as long as the first ones. Inria's script
 # lowers it by 30,000 iterations, however many it runs. With 7,000, positions took 10 to 15 times their first rate,
-# which cost Lego 2.4 dB, and bonsai at 399 pixels 0.5 dB. With a bound of 2 instead of 0.7, Lego ends 0.23 dB lower, and
-# bonsai 0.07 dB higher.
+# which cost Lego 2.4 dB, and bonsai at 399 pixels 0.5 dB. With a bound of 2 instead of 0.7, Lego ends 0.22 dB lower,
+# and bonsai 0.07 dB higher.
 LONGEST_POSITIONS = 1.0
 # On fern each view comes up 32 to 44 times, and 11 times the first rate ends 0.25 dB higher than twice. So the bound
 # goes with the square of the visits, over which the noise of single views averages out. On a fox's head, 17 visits,
