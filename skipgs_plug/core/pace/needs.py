@@ -104,14 +104,12 @@ LAST_FACTOR = 2.0
 
 # Refining (after densification ends).
 # Largest rate of positions, as a multiple of their first one, if each view comes up `AVERAGING_VISITS` times at most.
-# Most trainers have lowered the rate to a tenth by then, so that steps are as long as the first ones. Inria's script
-# lowers it by 30,000 iterations, however many it runs. With 7,000, positions took 10 to 15 times their first rate,
-# which cost Lego 2.4 dB, and bonsai at 399 pixels 0.5 dB. With a bound of 2 instead of 0.7, Lego ends 0.22 dB lower,
-# and bonsai 0.07 dB higher.
-LONGEST_POSITIONS = 1.0
-# On fern each view comes up 32 to 44 times, and 11 times the first rate ends 0.25 dB higher than twice. So the bound
-# goes with the square of the visits, over which the noise of single views averages out. On a fox's head, 17 visits,
-# 1.2 and 3.4 times the first rate end level, and 6.8 times 0.13 dB lower.
+# Most trainers have lowered the rate to a tenth by then, so that steps are 2 to 2.7 times as long as the first ones.
+# Inria's script lowers it by 30,000 iterations, however many it runs. With 7,000, positions took 10 to 15 times their
+# first rate, which cost Lego 2.4 dB, and bonsai at 399 pixels 0.5 dB. On fern each view comes up 32 to 44 times, and 11
+# times the first rate ends 0.25 dB higher than twice. So the bound goes with the visits, over which the noise of single
+# views averages out.
+LONGEST_POSITIONS = 2.0
 AVERAGING_VISITS = 10.0
 # Length of the path of opacities (sum of their rates) after their last reset. They begin at 0.01, however long their
 # steps are. Inria's script on bonsai at 798x531 pixels, 7,000 iterations, reset them at iteration 3,000: with a path of
@@ -141,11 +139,12 @@ RARE_SHARE_AFTER_FEW = 0.48
 # dB (.011 SSIM) below its own run with 3.4 visits, 0.18 dB (.007) with 4.8, and 0.02 dB above it (-.004) with 6.9. The
 # package's trainer ends above its own run with 4 visits there.
 REFINING_VISITS = 7.0
-# Least share of the iterations that run there, up to `MOST_FOR_SLOW_POSITIONS` iterations. Of 7,000 iterations, 743 of
-# 3,500 ended 0.27 dB below the own run on a fox's head, 1,050 ended 0.13 dB below it, and 1,400 level. On Lego they
-# ended 0.23 dB below it, and 0.05 dB above with 1,050. Fewer views than 150 need it, by `REFINING_VISITS`.
-SHARE_FOR_SLOW_POSITIONS = 0.3
-MOST_FOR_SLOW_POSITIONS = 1050
+# Least share of the iterations that run there, up to `MOST_FOR_SLOW_POSITIONS` iterations; with fewer than 175 views,
+# `REFINING_VISITS` asks for less. Of 7,000 iterations, 743 of 3,500 ended 0.27 dB below the own run on a fox's head,
+# 1,050 ended 0.13 dB below it, and 1,400 ended 0.05 dB above. Lego ended 0.23 dB below it and 0.05 dB above with the
+# first two.
+SHARE_FOR_SLOW_POSITIONS = 0.35
+MOST_FOR_SLOW_POSITIONS = 1225
 
 
 def last_part(iterations: int, since_reset: int | None) -> int:
@@ -164,7 +163,7 @@ def longest_positions(visits: float | None) -> float:
     Args:
         visits: Number of iterations of refinement that run, per training view; None if the views are unknown.
     """
-    return LONGEST_POSITIONS * max(1.0, (visits or 0.0) / AVERAGING_VISITS) ** 2
+    return LONGEST_POSITIONS * max(1.0, (visits or 0.0) / AVERAGING_VISITS)
 
 
 def opacity_rate(steps: float) -> float:

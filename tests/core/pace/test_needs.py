@@ -42,7 +42,7 @@ def test_shares_that_auto_chooses():
     assert refining_share(1000, 17) == 0.4 and refining_share(1000, 17, grown=1000) == 0.55
     assert refining_share(3500, 255, 3500, slow_positions=True) == pytest.approx(7 * 255 / 3500)
     assert refining_share(15_000, 255, 15_000, slow_positions=True) == refining_share(15_000, 255, 15_000)
-    assert refining_share(3500, 43, 3500, slow_positions=True) == 0.3 > refining_share(3500, 43, 3500)
+    assert refining_share(3500, 43, 3500, slow_positions=True) == 0.35 > refining_share(3500, 43, 3500)
     assert refining_share(1500, 17, 1500, slow_positions=True) == refining_share(1500, 17, 1500)
     assert refining_share(500, 17, grown=500) == 0.8
     assert refining_share(15_000, 255, grown=15_000) == pytest.approx(0.1733, abs=1e-3)

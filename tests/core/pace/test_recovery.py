@@ -80,7 +80,7 @@ def test_the_bound_holds_for_each_step_while_the_trainer_lowers_its_rate(rates):
 
 def test_with_more_visits_of_each_view_positions_take_longer_steps():
     assert longest_positions(None) == longest_positions(3.0) == longest_positions(AVERAGING_VISITS) == LONGEST_POSITIONS
-    assert longest_positions(4 * AVERAGING_VISITS) == 16 * LONGEST_POSITIONS
+    assert longest_positions(4 * AVERAGING_VISITS) == 4 * LONGEST_POSITIONS
 
 
 @pytest.mark.parametrize("first", [RATE, 0.0])
