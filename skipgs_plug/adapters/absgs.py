@@ -15,7 +15,7 @@ class AbsGS(InriaFamily):
     """
 
     name = "absgs"
-    checked = "TY424/AbsGS 87d7a5aa (its script, run on the CPU)"
+    checked = "TY424/AbsGS 87d7a5aa (its script run)"
     project = "[AbsGS](https://github.com/TY424/AbsGS)"
     gated = "From `densify_until_iter` on, with `--use_prune_weight` from `prune_until_iter` on."
     left_alone = "Blend weights are gathered in skipped iterations too, since they come from the forward."

@@ -10,7 +10,7 @@ class DashGaussian(InriaFamily):
     """Resolution and number of Gaussians are scheduled until `densify_until_iter`, and constant from then on."""
 
     name = "dash_gaussian"
-    checked = "YouyuChen0207/DashGaussian 4e3b5606 (train_dash.py, run on the CPU)"
+    checked = "YouyuChen0207/DashGaussian 4e3b5606 (train_dash.py run)"
     project = "[DashGaussian, `train_dash.py`](https://github.com/YouyuChen0207/DashGaussian)"
     gated = "From `densify_until_iter` on: resolution and number of Gaussians are constant."
     left_alone = (

@@ -29,7 +29,7 @@ class FastGS(InriaFamily):
     """
 
     name = "fastgs"
-    checked = "fastgs/FastGS 44e02a5c (its script, run on the CPU)"
+    checked = "fastgs/FastGS 44e02a5c (its script run)"
     project = "[FastGS](https://github.com/fastgs/FastGS)"
     gated = "From `densify_until_iter` on. The prunes at 18,000, 21,000, 24,000 and 27,000 pause the gate."
     left_alone = (

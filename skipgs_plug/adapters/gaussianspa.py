@@ -18,7 +18,7 @@ class GaussianSpa(InriaFamily):
     """
 
     name = "gaussianspa"
-    checked = "noodle-lab/GaussianSpa abdfaf64 (its three scripts, run on the CPU)"
+    checked = "noodle-lab/GaussianSpa abdfaf64 (its three scripts run)"
     project = "[GaussianSpa](https://github.com/noodle-lab/GaussianSpa)"
     gated = "From `optimizing_spa_stop_iter` + 1 on, after a pause for the prune in the iteration before."
     with_share = (

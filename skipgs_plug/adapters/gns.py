@@ -24,7 +24,7 @@ class GNS(ImprovedGS):
     """
 
     name = "gns"
-    checked = "XiaoBin2001/GNS 0c8e7dcd (train.py run on the CPU; train-fast.py read)"
+    checked = "XiaoBin2001/GNS 0c8e7dcd (train.py run; train-fast.py read)"
     project = "[GNS](https://github.com/XiaoBin2001/GNS)"
     gated = (
         "`train.py`: from `reg_end` + 1 (23,001) on, after the selection by opacity, or without `prune_reg` from "

@@ -40,7 +40,7 @@ class GsplatRunner(AbstractAdapter):
     """
 
     name = "gsplat"
-    checked = "nerfstudio-project/gsplat v1.5.3 and v1.6.0 90d7b4b3 (its script, run on the CPU)"
+    checked = "nerfstudio-project/gsplat v1.5.3 and v1.6.0 90d7b4b3 (its script run)"
     project = "[gsplat, `examples/simple_trainer.py`](https://github.com/nerfstudio-project/gsplat)"
     gated = "From `strategy.refine_stop_iter` on (15,000, for MCMC 25,000)."
     with_share = "By visits; with MCMC, all events are kept. Opacity resets happen as often as ever."

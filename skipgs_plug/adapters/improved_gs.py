@@ -18,7 +18,7 @@ class ImprovedGS(InriaFamily):
     """
 
     name = "improved_gs"
-    checked = "XiaoBin2001/Improved-GS d008d118 (its script, run on the CPU)"
+    checked = "XiaoBin2001/Improved-GS d008d118 (its script run)"
     project = "[Improved-GS](https://github.com/XiaoBin2001/Improved-GS)"
     gated = "From `densify_until_iter` on."
     left_alone = (

@@ -369,7 +369,7 @@ class Inria(InriaFamily):
     """
 
     name = "inria"
-    checked = "graphdeco-inria/gaussian-splatting 8a70a8cd and 54c035f (their scripts, run on the CPU)"
+    checked = "graphdeco-inria/gaussian-splatting 8a70a8cd and 54c035f (their scripts run)"
     project = "[Inria 3DGS](https://github.com/graphdeco-inria/gaussian-splatting)"
     gated = "From `densify_until_iter` on, or from the beginning if options keep the loop from densification."
     left_alone = (

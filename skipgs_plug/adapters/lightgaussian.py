@@ -17,7 +17,7 @@ class LightGaussian(InriaFamily):
     """
 
     name = "lightgaussian"
-    checked = "VITA-Group/LightGaussian 6676b983 (its three scripts, run on the CPU)"
+    checked = "VITA-Group/LightGaussian 6676b983 (its three scripts run)"
     project = "[LightGaussian](https://github.com/VITA-Group/LightGaussian)"
     gated = (
         "`prune_finetune.py`: from the second iteration of the run on, after a pause, since the first one prunes. "

@@ -25,7 +25,7 @@ class MCMC(InriaFamily):
     """
 
     name = "mcmc"
-    checked = "ubc-vision/3dgs-mcmc 7b4fc9f7 (its script, run on the CPU)"
+    checked = "ubc-vision/3dgs-mcmc 7b4fc9f7 (its script run)"
     project = "[3DGS-MCMC](https://github.com/ubc-vision/3dgs-mcmc)"
     gated = (
         "From `densify_until_iter` (25,000) on, when relocation has ended. A gate that you start earlier runs the "

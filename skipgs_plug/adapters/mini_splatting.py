@@ -17,7 +17,7 @@ class MiniSplatting(InriaFamily):
     """
 
     name = "mini_splatting"
-    checked = "fatPeter/mini-splatting c0d5581 (ms/train.py run on the CPU; ms_d/train.py read)"
+    checked = "fatPeter/mini-splatting c0d5581 (ms/train.py run; ms_d/train.py read)"
     project = "[Mini-Splatting](https://github.com/fatPeter/mini-splatting)"
     gated = (
         "`ms/train.py`: from `simp_iteration2` + 1 on, after a pause for the prune in that iteration. `ms_d/train.py`, "

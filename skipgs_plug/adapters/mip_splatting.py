@@ -12,7 +12,7 @@ class MipSplatting(InriaFamily):
     """
 
     name = "mip_splatting"
-    checked = "autonomousvision/mip-splatting dda02ab5 (its script, run on the CPU)"
+    checked = "autonomousvision/mip-splatting dda02ab5 (its script run)"
     project = "[Mip-Splatting](https://github.com/autonomousvision/mip-splatting)"
     gated = "From `densify_until_iter` on."
     left_alone = (

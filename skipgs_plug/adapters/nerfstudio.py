@@ -37,7 +37,7 @@ class Nerfstudio(AbstractAdapter):
     """
 
     name = "nerfstudio"
-    checked = "nerfstudio-project/nerfstudio 1.1.5 50e0e3c7 (ns-train, run on the CPU)"
+    checked = "nerfstudio-project/nerfstudio 1.1.5 50e0e3c7 (ns-train run)"
     project = "[nerfstudio, splatfacto and splatfacto-mcmc](https://github.com/nerfstudio-project/nerfstudio)"
     gated = (
         "Like gsplat, by `main_loss`: other terms come every tenth iteration. Models that densify themselves "

@@ -16,7 +16,7 @@ class OctreeGS(InriaFamily):
     """
 
     name = "octree_gs"
-    checked = "city-super/Octree-GS 9db64fe (its script, run on the CPU)"
+    checked = "city-super/Octree-GS 9db64fe (its script run)"
     project = "[Octree-GS](https://github.com/city-super/Octree-GS)"
     gated = "From `update_until` on, or with `progressive` from the end of `coarse_iter` on, whichever is later."
     left_alone = (

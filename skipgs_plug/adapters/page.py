@@ -24,8 +24,8 @@ With `share`, densification events are left out *by visits*, when the Gaussians 
 iterations*, when fewer iterations ran before them than their thresholds count. All events are kept where each one adds
 by a budget, a constant share or a resolution.
 
-`skipgs-plug run NAME -- SCRIPT ...` takes the name, or `auto`, which finds it in the script. Checks are in
-[examples/README.md](../examples/README.md).
+`skipgs-plug run NAME -- SCRIPT ...` takes the name, or `auto`, which finds it in the script. Scripts were
+checked with `--cpu`; [examples/README.md](../examples/README.md) has the details.
 
 The gate cannot attach to compiled trainers, whose backward pass never goes through Python: Brush (Rust), LichtFeld
 Studio and OpenSplat (C++), Postshot (closed). Nor can it to forks whose loop is not in `training()`: 4DGaussians.

@@ -15,7 +15,7 @@ class PerceptualGS(InriaFamily):
     """
 
     name = "perceptual_gs"
-    checked = "eezkni/Perceptual-GS 991f196 (its script, run on the CPU)"
+    checked = "eezkni/Perceptual-GS 991f196 (its script run)"
     project = "[Perceptual-GS](https://github.com/eezkni/Perceptual-GS)"
     gated = (
         "From `densify_until_iter` + 1 on, after a pause if iteration `densify_until_iter` rebuilds the model. With "

@@ -13,7 +13,7 @@ class ScaffoldGS(InriaFamily):
     """Anchors are grown and pruned before `update_until`; networks are parameters of the same optimizer."""
 
     name = "scaffold_gs"
-    checked = "city-super/Scaffold-GS 59c833b5 (its script, run on the CPU)"
+    checked = "city-super/Scaffold-GS 59c833b5 (its script run)"
     project = "[Scaffold-GS](https://github.com/city-super/Scaffold-GS)"
     gated = "From `update_until` on: anchors are no longer grown or pruned."
     left_alone = "Networks and anchors have one optimizer, which is left alone."

@@ -16,7 +16,7 @@ class SpeedySplat(InriaFamily):
     """
 
     name = "speedy_splat"
-    checked = "j-alex-hanson/speedy-splat 6b523aa3 (its script, run on the CPU)"
+    checked = "j-alex-hanson/speedy-splat 6b523aa3 (its script run)"
     project = "[Speedy-Splat](https://github.com/j-alex-hanson/speedy-splat)"
     gated = (
         "From `densify_until_iter` + 1 on. Hard prunes happen at `densify_until_iter` and every `prune_interval` until "

@@ -41,7 +41,7 @@ class StepTrainer(AbstractAdapter):
     """
 
     name = "step_trainer"
-    checked = "gaussian-splatting 2.11.0 of PyPI (its script, run on the CPU)"
+    checked = "gaussian-splatting 2.11.0 of PyPI (its script run)"
     project = "[pip gaussian-splatting](https://pypi.org/project/gaussian-splatting/)"
     gated = (
         "From the last of its `_until_iter` bounds + 1 on, after a pause for the opacity reset on that bound. "

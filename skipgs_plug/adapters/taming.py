@@ -13,7 +13,7 @@ class Taming(InriaFamily):
     """
 
     name = "taming"
-    checked = "humansensinglab/taming-3dgs fd0f7d9e (its script, run on the CPU)"
+    checked = "humansensinglab/taming-3dgs fd0f7d9e (its script run)"
     project = "[Taming 3DGS](https://github.com/humansensinglab/taming-3dgs)"
     gated = "From `densify_until_iter` on."
     left_alone = (
