@@ -105,6 +105,7 @@ def test_auto_asks_the_photographs():
     runner = LoadingRunner()
     gate = train(runner, share="auto")
     assert half_sizes(runner) and gate.report()["growing"]["half_size_psnr"] > 32
+    assert "dB and an SSIM of 0.9" in gate.summary()
 
 
 @pytest.mark.parametrize(

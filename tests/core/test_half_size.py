@@ -5,7 +5,10 @@ import math
 import pytest
 import torch
 
+from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.half_size import JUDGED, Kept, can_be_halved, halved, kept_at_half_size, some_of
+from skipgs_plug.core.pace.half_size import HalfSize
+from skipgs_plug.core.pace.phase import Phase, PhasePlan
 
 
 def test_each_value_is_the_mean_of_four():
@@ -48,6 +51,21 @@ def test_large_plain_areas_do_not_hide_lost_detail():
     kept = kept_at_half_size([texture])
     assert kept.psnr > 32 and kept.ssim < 0.9 and not kept.enough
     assert Kept(33.0, 0.95).enough and not Kept(31.0, 0.95).enough
+
+
+@pytest.mark.parametrize(("shade", "until"), [(1.0, 0), (0.0, 50)])
+def test_the_decision_outlasts_a_checkpoint(shade, until):
+    photographs = [shade * torch.rand(3, 32, 32)]  # noise, or black
+    plan = PhasePlan(range(80), {}, set(), 99, Phase(), None, None, None, False, lambda: photographs)
+    begun = HalfSize(SkipConfig(share="auto"))
+    begun.begin(plan)
+    report = begun.report()
+    assert report["half_size_until"] == until and (report["half_size_ssim"] > 0.92) == bool(until)
+    resumed = HalfSize(SkipConfig(share="auto"))
+    resumed.load_state_dict(begun.state_dict())
+    assert resumed.report() == report
+    resumed.load_state_dict([until, 33.0])  # of a version that took the PSNR alone
+    assert resumed.report() == {"half_size_until": until, "half_size_psnr": None, "half_size_ssim": None}
 
 
 def test_the_photographs_that_decide_are_spread_over_all():
