@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass
+
+from torch import Tensor
 
 from skipgs_plug import SkipGate
 from skipgs_plug.bench.memory import memory_meter
@@ -89,7 +92,10 @@ def run_pilot(
         trainer.train(progress=progress)
         report = gate.report()
     peak = None if meter is None else meter.peak()
-    photographs = (in_unit_range(scene.train[i].image) for i in some_of(len(scene.train)))  # one at a time in memory
+
+    def photographs() -> Iterator[Tensor]:  # one at a time in memory
+        return (in_unit_range(scene.train[i].image) for i in some_of(len(scene.train)))
+
     halves = kept_at_half_size(photographs).enough
     fading = bool(report["growing"] and report["growing"]["fading"])
     visible, views = report["gaussians_shown"], len(scene.train)

@@ -6,7 +6,16 @@ import pytest
 import torch
 
 from skipgs_plug.core.config import SkipConfig
-from skipgs_plug.core.half_size import JUDGED, Kept, can_be_halved, halved, kept_at_half_size, some_of
+from skipgs_plug.core.half_size import (
+    JUDGED,
+    Kept,
+    can_be_halved,
+    halved,
+    kept_at_half_size,
+    psnr_at_half_size,
+    some_of,
+    ssim_at_half_size,
+)
 from skipgs_plug.core.pace.half_size import HalfSize
 from skipgs_plug.core.pace.phase import Phase, PhasePlan
 
@@ -39,18 +48,23 @@ def test_half_the_size_must_hold_the_window_of_ssim(size, possible):
 def test_photographs_with_fine_detail_lose_more():
     stripes = (torch.arange(64) % 2).float().expand(3, 64, 64)  # half the size is grey
     smooth = torch.linspace(0, 1, 64).expand(3, 64, 64)
-    fine, plain, both = (kept_at_half_size(images) for images in ([stripes], [smooth], [smooth, stripes]))
-    assert fine.psnr == pytest.approx(-10 * math.log10(0.25), abs=1e-3) and fine.ssim < 0.1
-    assert plain.psnr > 45 and plain.ssim > 0.99
-    assert both == pytest.approx([(fine.psnr + plain.psnr) / 2, (fine.ssim + plain.ssim) / 2])
-    assert math.isfinite(kept_at_half_size([torch.zeros(3, 30, 30)]).psnr)
+    fine, plain, both = (
+        (psnr_at_half_size(images), ssim_at_half_size(images)) for images in ([stripes], [smooth], [smooth, stripes])
+    )
+    assert fine[0] == pytest.approx(-10 * math.log10(0.25), abs=1e-3) and fine[1] < 0.1
+    assert plain[0] > 45 and plain[1] > 0.99
+    assert both == pytest.approx([(fine[0] + plain[0]) / 2, (fine[1] + plain[1]) / 2])
+    assert math.isfinite(psnr_at_half_size([torch.zeros(3, 30, 30)]))
+    # Where the PSNR is too low, SSIM is not computed.
+    assert kept_at_half_size(lambda: [stripes]) == (pytest.approx(fine[0]), None)
+    assert kept_at_half_size(lambda: [smooth]) == pytest.approx(plain)
 
 
 def test_large_plain_areas_do_not_hide_lost_detail():
     texture = torch.rand(3, 96, 96, generator=torch.Generator().manual_seed(0)) * 0.09  # a faint one: its PSNR is high
-    kept = kept_at_half_size([texture])
+    kept = kept_at_half_size(lambda: [texture])
     assert kept.psnr > 32 and kept.ssim < 0.9 and not kept.enough
-    assert Kept(33.0, 0.95).enough and not Kept(31.0, 0.95).enough
+    assert Kept(33.0, 0.95).enough and not Kept(31.0, 0.95).enough and not Kept(33.0, None).enough
 
 
 @pytest.mark.parametrize(("shade", "until"), [(1.0, 0), (0.0, 50)])
@@ -60,7 +74,7 @@ def test_the_decision_outlasts_a_checkpoint(shade, until):
     begun = HalfSize(SkipConfig(share="auto"))
     begun.begin(plan)
     report = begun.report()
-    assert report["half_size_until"] == until and (report["half_size_ssim"] > 0.92) == bool(until)
+    assert report["half_size_until"] == until and ((report["half_size_ssim"] or 0.0) > 0.92) == bool(until)
     resumed = HalfSize(SkipConfig(share="auto"))
     resumed.load_state_dict(begun.state_dict())
     assert resumed.report() == report

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
-
-from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.half_size import Kept, kept_at_half_size
@@ -48,7 +45,7 @@ class HalfSize:
             return False
         if not self._config.may_halve or self._config.half_size:
             return self._config.may_halve
-        self.kept = Kept(*distributed.mean(torch.tensor(kept_at_half_size(plan.photographs()))))
+        self.kept = kept_at_half_size(plan.photographs)
         return self.kept.enough
 
     def holds(self, number: int) -> bool:
@@ -63,7 +60,7 @@ class HalfSize:
         """Return the entries of skipgs.json about such photographs.
 
         `half_size_until` (iteration before which photographs had half their size; 0 for none), `half_size_psnr`
-        (decibels) and `half_size_ssim` (what they keep at that size; None if it did not decide).
+        (decibels) and `half_size_ssim` (what they keep at that size; None for a measure that did not decide).
         """
         psnr, ssim = self.kept or (None, None)
         return {"half_size_until": self.until, "half_size_psnr": psnr, "half_size_ssim": ssim}
