@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any
@@ -139,7 +140,7 @@ class GsplatRunner(AbstractAdapter):
             TrainerInfo(
                 start,
                 view_names=names,
-                epoch=-(-len(runner.trainset) // runner.cfg.batch_size),
+                epoch=iterations_per_epoch(runner),
                 max_steps=last,
                 world_size=runner.world_size,
                 gradients_read_until=read_until,
@@ -171,6 +172,14 @@ def refuse_frozen(cfg: Any, hooks: Hooks) -> None:
             "every iteration at its own learning rate; gate without share, refine_share and compensate, or give the "
             "script --no-ppisp_controller_distillation."
         )
+
+
+def iterations_per_epoch(runner: Any) -> int:
+    """Return how many iterations show as many pixels as all training views have. They may show random patches."""
+    views, side = len(runner.trainset), getattr(runner.cfg, "patch_size", None)
+    sizes = list(getattr(runner.parser, "imsize_dict", {}).values()) if side else []  # width, height
+    patches = [max(width / side, 1.0) * max(height / side, 1.0) for width, height in sizes]
+    return math.ceil(views * (sum(patches) / len(patches) if patches else 1.0) / runner.cfg.batch_size)
 
 
 def view_names(runner: Any) -> list[str]:

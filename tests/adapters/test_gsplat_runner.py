@@ -240,10 +240,11 @@ def test_the_papers_gate_skips_no_backward_of_the_controller(monkeypatch):
     assert gated.controller.item() != plain.controller.item() != 1.0  # the gated one was trained on other Gaussians
 
 
-@pytest.mark.parametrize("batch_size, share", [(1, 0.353), (2, 0.297)])
-def test_batches_count_towards_the_visits_of_each_view(batch_size, share, monkeypatch):
-    """Of 1,040 views each is seen once in 520 iterations of two: "auto" needs fewer than of one at a time."""
-    runner = HeadRunner(DefaultStrategy(), batch_size=batch_size)
+@pytest.mark.parametrize("batch_size, patch_size, share", [(1, None, 0.353), (2, None, 0.297), (1, 20, 0.42)])
+def test_batches_and_patches_count_towards_the_visits_of_each_view(batch_size, patch_size, share, monkeypatch):
+    """Of 1,040 views each is seen once in 520 iterations of two, but in 2,080 iterations of a half."""
+    runner = HeadRunner(DefaultStrategy(), batch_size=batch_size, patch_size=patch_size)
+    runner.parser.imsize_dict = {1: (40, 20)}
     runner.cfg.max_steps = 3020
     names = runner.parser.image_names
     names += [f"more/{i}.png" for i in range(1040 - len(runner.trainset))]
