@@ -105,7 +105,8 @@ FACTS = (
     "steps_each: 'bool' = False, "
     "densification: 'Densification | None' = None, "
     "photographs: 'Callable[[], Iterable[Tensor]] | None' = None, "
-    "slow_positions: 'bool' = False, positions_rate: 'float' = 0.0, defaults: 'Mapping[str, Any]' = <factory>) -> None"
+    "slow_positions: 'bool' = False, positions_rate: 'float' = 0.0, random_points: 'bool' = False, "
+    "defaults: 'Mapping[str, Any]' = <factory>) -> None"
 )
 POLICY = {
     "decide": "(self, view: 'Hashable', loss: 'float', step: 'int') -> 'Decision'",

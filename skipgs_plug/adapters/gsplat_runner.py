@@ -145,6 +145,7 @@ class GsplatRunner(AbstractAdapter):
                 world_size=runner.world_size,
                 gradients_read_until=read_until,
                 densification=None if survey.unknown else strategy_events(strategy),
+                random_points=getattr(runner.cfg, "init_type", None) == "random",
                 photographs=None if survey.unknown else show_half_size_batches(hooks, runner),
             )
         )

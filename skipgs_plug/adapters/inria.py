@@ -23,7 +23,7 @@ from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
 from skipgs_plug.adapters.half_size_cameras import HalfSizeCameras
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_bounds import READS_GRADIENT, SETS_END, read_loops
-from skipgs_plug.adapters.loop_code import LOOP, OPTIONS, LoopCode, names_around, namespace_of
+from skipgs_plug.adapters.loop_code import LOOP, OPTIONS, LoopCode, asks_for_random_points, names_around, namespace_of
 from skipgs_plug.adapters.unknown_forks import (
     BY_HAND,
     CALLS,
@@ -60,8 +60,7 @@ class InriaFamily(AbstractAdapter):
         changes: Further methods that change the model. The gate begins after the last call of these and `structural`.
         pausing: Methods in `changes` that the trainer also calls after the gate has begun. Each call pauses the gate.
         uses: Uses of attributes that put the gate's start off or refuse it; see `loop_bounds`.
-        calls: Further names that the adapter knows beyond those of Inria's loop: methods of the model, functions that
-            draw noise, methods that change a tensor in place.
+        calls: Further names of methods and noise that the adapter knows beyond those of Inria's loop.
         arguments: Arguments of the renderer that the adapter knows, beyond those of Inria's.
         densification: How to recognise its densification events; None if all iterations of densification must run.
         pure: Functions and methods that depend on the iteration, and need no iteration besides those of `always_run`.
@@ -341,6 +340,7 @@ class InriaFamily(AbstractAdapter):
                 steps_each=self.steps_each(opt, loop),
                 slow_positions=True,  # they reach their last rate in `position_lr_max_steps`, by default 30,000
                 positions_rate=rate_of_positions(held_by(self._model())),
+                random_points=asks_for_random_points(loop),
                 photographs=None if self._cameras is None else self._cameras.photographs,
             )
         )

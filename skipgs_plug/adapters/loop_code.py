@@ -173,6 +173,11 @@ def names_around(caller: types.FrameType) -> Mapping[str, Any]:
     return ChainMap(*(dict(frame.f_locals) for frame in frames), frames[-1].f_globals)
 
 
+def asks_for_random_points(names: Mapping[str, Any]) -> bool:
+    """Return whether options among a loop's variables ask for random points, as `--init_type random` of 3DGS-MCMC."""
+    return any(getattr(value, "__dict__", {}).get("init_type") == "random" for value in names.values())
+
+
 def function_names(function: Callable[..., Any]) -> dict[str, Any]:
     """Return the global names of a function under its decorators."""
     return inspect.unwrap(function).__globals__  # type: ignore[attr-defined]

@@ -167,15 +167,16 @@ def _summarise_growing(growing: dict[str, Any]) -> str:
     return (
         f"SkipGS: {run:,} of {run + skipped:,} iterations run ({percent:.1f} %) while the scene grows, with "
         f"{growing['events_run']:,} of {growing['events_run'] + growing['events_skipped']:,} densification "
-        f"events{longer}.{_why_more(growing)}{_fading(growing)}{_half_size(growing)}"
+        f"events{longer}.{_why_more(growing)}{_random_points(growing)}{_half_size(growing)}"
     )
 
 
-def _fading(growing: dict[str, Any]) -> str:
+def _random_points(growing: dict[str, Any]) -> str:
     """Return a line about random points; empty if the scene did not begin with them."""
-    if not growing["fading"]:
+    if not growing["random_points"]:
         return ""
-    return "\n  the points that the scene began with fade, as random ones do; this needs more iterations"
+    fade = "the points that the scene began with fade, as random ones do"
+    return f"\n  {fade if growing['fading'] else 'the scene began with random points'}; this needs more iterations"
 
 
 def _half_size(growing: dict[str, Any]) -> str:

@@ -71,6 +71,8 @@ class TrainerInfo:
             half their size while `Hooks.at_half_size`; None if it cannot.
         slow_positions: Whether the trainer may lower the learning rate of positions too slowly for its schedule.
         positions_rate: First learning rate of positions then; 0 if it is not known.
+        random_points: Whether the trainer says that the scene begins with random points. They are also recognised by
+            opacities that fall, unless a regulariser lowers them all (MCMC).
         defaults: Settings that suit this trainer. They are used where the user gave no value.
     """
 
@@ -88,4 +90,5 @@ class TrainerInfo:
     photographs: Callable[[], Iterable[Tensor]] | None = None
     slow_positions: bool = False
     positions_rate: float = 0.0
+    random_points: bool = False
     defaults: Mapping[str, Any] = dataclasses.field(default_factory=dict)

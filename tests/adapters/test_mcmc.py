@@ -1,13 +1,15 @@
 """3DGS-MCMC: noise follows the gate, and relocation is never left out."""
 
+import pytest
 import torch
-from cases import SkipAlways, run, script
+from cases import SkipAlways, gsplat, run, script
 from lookalikes import gsplat_runner, mcmc
 
 from skipgs_plug.adapters.gsplat_strategy import strategy_events
 from skipgs_plug.adapters.inria import InriaFamily
 from skipgs_plug.adapters.mcmc import MCMC
 from skipgs_plug.core import decision
+from skipgs_plug.core.pace import growing, needs
 
 CASE = script("mcmc", mcmc)
 
@@ -37,3 +39,24 @@ def test_longer_steps_are_tolerated_where_opacities_are_never_reset():
     assert not MCMC.densification.resets and InriaFamily.densification.resets
     assert not strategy_events(gsplat_runner.MCMCStrategy()).resets
     assert strategy_events(gsplat_runner.DefaultStrategy()).resets
+
+
+@pytest.mark.parametrize("init_type", ["sfm", "random"])
+@pytest.mark.parametrize("name", ["script", "gsplat"])
+def test_random_points_need_more_iterations(name, init_type, monkeypatch):
+    """A regulariser lets all opacities fall, so that only the trainer's option tells of random points."""
+    for name_of_need in ("LEAST_GROWING_STEPS", "LEAST_GROWING_STEPS_LONGER", "STEPS_PER_EVENT", "GROWING_VISITS"):
+        monkeypatch.setattr(needs, name_of_need, 1)
+    monkeypatch.setattr(needs, "GROWING_STEPS_FROM_RANDOM", 16)
+    monkeypatch.setattr(needs, "GROWING_SIGHTS_FROM_RANDOM", 0)
+    monkeypatch.setattr(growing, "MEASURED", 2)
+    runner, strategy = gsplat_runner.Runner, gsplat_runner.MCMCStrategy
+    cases = {
+        "script": script("mcmc", mcmc, init_type=init_type),
+        "gsplat": gsplat("mcmc", runner, strategy, init_type=init_type),
+    }
+    _, gate = run(cases[name], share="auto")
+    report, is_random = gate.report()["growing"], init_type == "random"
+    assert report["random_points"] == is_random and not report["fading"]
+    assert (report["share"] > 0.7) == is_random
+    assert ("random points" in gate.summary()) == is_random

@@ -81,6 +81,7 @@ class Growing(Phase):
         self._measuring = True
         self.half_size = HalfSize(config)
         self._fading = False  # whether the points that the scene began with faded
+        self._random = False  # whether they did, or the trainer says that they are random
         self._reset: int | None = None  # iteration of the last opacity reset; None without one, or if it is unknown
         self._resets = True  # whether opacities are reset in this phase, or it is not known
         self._whole_from: int | None = None  # iteration from which all run, if no or hardly any refinement follows
@@ -142,7 +143,7 @@ class Growing(Phase):
         if self._unrefined or (self._auto and following <= 0):
             self._whole_from = max(plan.last + 1 - last, self._first)
             self._must |= set(range(self._whole_from, numbers.stop))
-        self._epoch = plan.epoch or self._epoch
+        self._epoch, self._random = plan.epoch or self._epoch, plan.random_points or self._fading
         self.half_size.begin(plan)
         return True
 
@@ -277,23 +278,24 @@ class Growing(Phase):
         if self._visible is not None:
             # Where opacities are never reset, as in MCMC, a regulariser lets all of them fall.
             self._fading = self._rates.fading.finish() and self.events.resets
-            if self._fading and not self._auto:
-                self._warn_of_fading()
+            self._random |= self._fading
+            if self._random and not self._auto:
+                self._warn_of_random_points()
         if self._auto:
             longer = self._config.compensates and self._visible is not None
             events = len(self.events) if self.events.all_run else 0
-            shown = self._visible if self._fading else None
+            shown = self._visible if self._random else None
             self.share = growing_share(self._length, self._epoch, longer, events, shown, self._opacities_recover)
 
-    def _warn_of_fading(self) -> None:
+    def _warn_of_random_points(self) -> None:
         """Warn if the share that the user gave is too small for a scene of random points."""
         assert self.share is not None
         enough = growing_share(self._length, self._epoch, longer=True, shown_of_random=self._visible)
         if self._has_longer_steps and self.share < enough:
             caution(
-                f"The points that the scene began with fade, as random ones do. With a share of {self.share:g}, "
-                f"{self.share * self._length:,.0f} iterations run until densification ends, and such points can stay "
-                f'as haze: give grow_share={math.ceil(100 * enough) / 100:g} or "auto".'
+                f"The scene began with random points, or its points fade as random ones do. With a share of "
+                f"{self.share:g}, {self.share * self._length:,.0f} iterations run until densification ends, and such "
+                f'points can stay as haze: give grow_share={math.ceil(100 * enough) / 100:g} or "auto".'
             )
 
     def _factors(self, number: int) -> tuple[float, GrowingParts]:
@@ -337,8 +339,8 @@ class Growing(Phase):
 
         `share`, `iterations_run`, `iterations_skipped`, `events_run`, `events_skipped`, `rate_factor`,
         `opacity_rate_factor`, `times_grown` (Gaussians at the last event, as a multiple of those at the first; None if
-        unknown), `fading` (whether the points that the scene began with faded), those of `HalfSize.report`, and
-        `always_run`.
+        unknown), `fading` (whether the points that the scene began with faded), `random_points` (whether they did, or
+        the trainer said so), those of `HalfSize.report`, and `always_run`.
         """
         if self._first is None:
             return None
@@ -355,6 +357,7 @@ class Growing(Phase):
             "opacity_rate_factor": None if parts is None else parts.opacities,
             "times_grown": self._times_grown,
             "fading": self._fading,
+            "random_points": self._random or self._fading,
             **self.half_size.report(),
             "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
         }

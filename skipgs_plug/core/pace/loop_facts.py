@@ -51,7 +51,7 @@ class LoopFacts:
         self._known: Known = nothing_known
         self._accumulates = self._steps_each = False
         self._photographs: Callable[[], Iterable[Tensor]] | None = None
-        self._slow_positions, self._positions_rate = False, 0.0
+        self._slow_positions, self._positions_rate, self._random_points = False, 0.0, False
         self._views: list[str] | None = None
         self._epoch: int | None = None  # iterations that show every view once; None if that is the number of views
 
@@ -61,6 +61,7 @@ class LoopFacts:
         self._accumulates, self._steps_each, self._epoch = info.accumulates, info.steps_each, info.epoch
         self.densification = info.densification or self.densification
         self._photographs, self._slow_positions = info.photographs, info.slow_positions
+        self._random_points = info.random_points
         self._positions_rate = self._positions_rate or info.positions_rate  # a resumed run begins with another one
 
     def describe(self, always: Always, pure: Iterable[str], densification: Densification | None, known: Known) -> None:
@@ -132,6 +133,7 @@ class LoopFacts:
             self._photographs,
             self._slow_positions,
             self._positions_rate,
+            self._random_points,
             self._steps_each,
         )
 

@@ -45,7 +45,11 @@ def test_shares_that_auto_chooses():
     assert refining_share(3500, 43, 3500, slow_positions=True) == 0.35 > refining_share(3500, 43, 3500)
     assert refining_share(1500, 17, 1500, slow_positions=True) == refining_share(1500, 17, 1500)
     assert refining_share(500, 17, grown=500) == 0.8
-    assert refining_share(15_000, 255, grown=15_000) == pytest.approx(0.1733, abs=1e-3)
+    # A thousandth of the iterations runs for each view, but at most a quarter for all. 15 visits of each are enough.
+    assert refining_share(15_000, 255, grown=15_000) == refining_share(6000, 255, grown=6000) == 0.25
+    assert refining_share(15_000, 200, grown=15_000) == 0.2 == pytest.approx(15 * 200 / 15_000)
+    assert refining_share(60_000, 255, grown=60_000) == pytest.approx(0.1225, abs=1e-3)
+    assert refining_share(15_000, 100, grown=15_000) == pytest.approx(0.1372, abs=1e-3)
     assert refining_share(15_000, 17, grown=15_000) == 0.12 < refining_share(15_000, 17) == 0.2
     # Refinement of a sixth of the schedule runs as many iterations as one of a half, but never all of its own.
     assert 5000 * refining_share(5000, 100, grown=25_000) == pytest.approx(15_000 * refining_share(15_000, 100, 15_000))
