@@ -4,6 +4,7 @@ import pytest
 import torch
 from cases import SkipAlways, gsplat, run, script
 from lookalikes import gsplat_runner, mcmc
+from lookalikes.splats import log
 
 from skipgs_plug.adapters.gsplat_strategy import strategy_events
 from skipgs_plug.adapters.inria import InriaFamily
@@ -47,8 +48,7 @@ def test_random_points_need_more_iterations(name, init_type, monkeypatch):
     """A regulariser lets all opacities fall, so that only the trainer's option tells of random points."""
     for name_of_need in ("LEAST_GROWING_STEPS", "LEAST_GROWING_STEPS_LONGER", "STEPS_PER_EVENT", "GROWING_VISITS"):
         monkeypatch.setattr(needs, name_of_need, 1)
-    monkeypatch.setattr(needs, "GROWING_STEPS_FROM_RANDOM", 16)
-    monkeypatch.setattr(needs, "GROWING_SIGHTS_FROM_RANDOM", 0)
+    monkeypatch.setattr(needs, "GROWING_SIGHTS_IF_MOVED", 16)
     monkeypatch.setattr(growing, "MEASURED", 2)
     runner, strategy = gsplat_runner.Runner, gsplat_runner.MCMCStrategy
     cases = {
@@ -60,3 +60,21 @@ def test_random_points_need_more_iterations(name, init_type, monkeypatch):
     assert report["random_points"] == is_random and not report["fading"]
     assert (report["share"] > 0.7) == is_random
     assert ("random points" in gate.summary()) == is_random
+
+
+@pytest.mark.parametrize("init_type", ["sfm", "random"])
+def test_the_beta2_stays_where_views_show_few_of_the_random_points(init_type, monkeypatch):
+    betas = {}
+
+    class Adam(torch.optim.Adam):
+        def step(self, closure=None):
+            for group in self.param_groups:
+                betas.setdefault(log.now < 20, set()).add(group["betas"][1])
+            return super().step(closure)
+
+    monkeypatch.setattr(torch.optim, "Adam", Adam)
+    monkeypatch.setattr(growing, "MEASURED", 2)
+    monkeypatch.setattr(growing, "SELDOM_SHOWN", 1.1)
+    run(gsplat("mcmc", gsplat_runner.Runner, gsplat_runner.MCMCStrategy, init_type=init_type), share=0.3)
+    assert (betas[True] == {0.999}) == (init_type == "random")
+    assert 0.98 in betas[False]  # refinement is as ever

@@ -18,6 +18,7 @@ from skipgs_plug.core.pace.needs import (
     LONGEST_STEPS_OF_POSITIONS_THAT_STAY,
     LONGEST_STEPS_OF_SCALES,
     MOST_RAISED_SHARE,
+    SELDOM_SHOWN,
     for_new_gaussians,
     geometry_part,
     growing_factor,
@@ -266,8 +267,7 @@ class Growing(Phase):
     def _settle(self) -> None:
         """Use the present measurement; the share of the phase is fixed once enough steps are measured."""
         assert self.events is not None
-        visibility = self._rates.visibility
-        settled = self._visible is not None
+        visibility, settled = self._rates.visibility, self._visible is not None
         if self._measuring and visibility.steps >= (MEASURED_AGAIN if settled else MEASURED):
             self._visible_now, self._measuring = visibility.visible, False
         if not self._measuring:
@@ -279,23 +279,23 @@ class Growing(Phase):
             # Where opacities are never reset, as in MCMC, a regulariser lets all of them fall.
             self._fading = self._rates.fading.finish() and self.events.resets
             self._random |= self._fading
-            if self._random and not self._auto:
-                self._warn_of_random_points()
+            if self._fading and not self._auto:
+                self._warn_of_fading()
         if self._auto:
             longer = self._config.compensates and self._visible is not None
             events = len(self.events) if self.events.all_run else 0
-            shown = self._visible if self._random else None
-            self.share = growing_share(self._length, self._epoch, longer, events, shown, self._opacities_recover)
+            shown, moved = self._visible if self._random else None, not self.events.resets
+            self.share = growing_share(self._length, self._epoch, longer, events, shown, self._opacities_recover, moved)
 
-    def _warn_of_random_points(self) -> None:
+    def _warn_of_fading(self) -> None:
         """Warn if the share that the user gave is too small for a scene of random points."""
         assert self.share is not None
         enough = growing_share(self._length, self._epoch, longer=True, shown_of_random=self._visible)
         if self._has_longer_steps and self.share < enough:
             caution(
-                f"The scene began with random points, or its points fade as random ones do. With a share of "
-                f"{self.share:g}, {self.share * self._length:,.0f} iterations run until densification ends, and such "
-                f'points can stay as haze: give grow_share={math.ceil(100 * enough) / 100:g} or "auto".'
+                f"The points that the scene began with fade, as random ones do. With a share of {self.share:g}, "
+                f"{self.share * self._length:,.0f} iterations run until densification ends, and such points can stay "
+                f'as haze: give grow_share={math.ceil(100 * enough) / 100:g} or "auto".'
             )
 
     def _factors(self, number: int) -> tuple[float, GrowingParts]:
@@ -317,7 +317,8 @@ class Growing(Phase):
         positions = geometry_part(factor, LONGEST_STEPS_OF_POSITIONS if far else LONGEST_STEPS_OF_POSITIONS_THAT_STAY)
         if self._unrefined and not self._fading and not self._steps_after:
             return factor, GrowingParts(opacities, positions, scales, True, HIGHEST_OPACITY_RATE)
-        return factor, GrowingParts(opacities, positions, scales, events.clears_moments)
+        remember = self._random and not events.resets and self._visible < SELDOM_SHOWN
+        return factor, GrowingParts(opacities, positions, scales, events.clears_moments, all_remember=remember)
 
     @property
     def _opacities_recover(self) -> bool:
@@ -387,8 +388,7 @@ class Growing(Phase):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.share, self._first = state["share"], state["first"]
-        until, after = state.get("must_shares", (1.0, 1.0))
-        self._must_shares = until, after
+        self._must_shares = state.get("must_shares", (1.0, 1.0))
         self._epoch = state["views"]
         self._measuring, self._fading = state["measuring"], state.get("fading", False)
         self._share_now, self._rows_at_first = state.get("share_now"), state.get("gaussians_at_first", 0)

@@ -189,6 +189,7 @@ class GrowingParts(NamedTuple):
         opacities_remember: Whether opacities keep the trainer's beta2.
         highest_opacity_rate: Learning rate that longer steps of opacities do not exceed.
         only_higher_bands: Whether no steps are longer but those of the colours' higher bands.
+        all_remember: Whether all parameters keep the trainer's beta2; see `needs.SELDOM_SHOWN`.
     """
 
     opacities: float
@@ -197,6 +198,7 @@ class GrowingParts(NamedTuple):
     opacities_remember: bool = False
     highest_opacity_rate: float = math.inf
     only_higher_bands: bool = False
+    all_remember: bool = False
 
     def of(self, info: GroupInfo) -> float:
         """Return the multiple of the common factor that a group other than opacities takes; 0 if it keeps its rate."""
@@ -287,7 +289,7 @@ def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
         rate = info.rate
         times = (1.0 if growing is None else growing.of_opacities(rate)) * _recovering(rate, opacity_rate)
         if growing is None or times > 1.0 or (raised and not growing.only_higher_bands):
-            remembers = growing is not None and growing.opacities_remember
+            remembers = growing is not None and (growing.opacities_remember or growing.all_remember)
             return ScaledGroup(info.group, times, 1.0, None if remembers else info)
         return None
     if not raised:
@@ -296,7 +298,8 @@ def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
     if part == 0.0:
         return None
     highest = positions_rate if growing is None and info.named_positions else math.inf
-    return ScaledGroup(info.group, part, math.inf, info, highest)
+    remembers = growing is not None and growing.all_remember
+    return ScaledGroup(info.group, part, math.inf, None if remembers else info, highest)
 
 
 def _recovering(rate: float, least: float) -> float:

@@ -53,6 +53,9 @@ def test_a_scene_of_random_points_needs_more_iterations():
     assert growing_share(1500, 17, longer=True, shown_of_random=1.0) == 1.0
     seldom_shown = growing_share(15_000, 255, longer=True, shown_of_random=0.2)
     assert seldom_shown == pytest.approx(5 * GROWING_SIGHTS_FROM_RANDOM / 15_000)
+    # Points that are moved need not fade.
+    assert growing_share(5832, 255, longer=True, shown_of_random=0.1, moved=True) == pytest.approx(2700 / 5832)
+    assert growing_share(15_000, 100, longer=True, shown_of_random=1.0, moved=True) == 0.1
 
 
 def train(gate, direction, until=LAST, note=None):
