@@ -174,8 +174,12 @@ def names_around(caller: types.FrameType) -> Mapping[str, Any]:
 
 
 def asks_for_random_points(names: Mapping[str, Any]) -> bool:
-    """Return whether options among a loop's variables ask for random points, as `--init_type random` of 3DGS-MCMC."""
-    return any(getattr(value, "__dict__", {}).get("init_type") == "random" for value in names.values())
+    """Return whether the options of a loop ask for random points, as `--init_type random` of 3DGS-MCMC does.
+
+    Only the loop's own variables count: a script has objects with the defaults of all options, too.
+    """
+    given = (getattr(names.get(name), "init_type", None) for name in ("dataset", OPTIONS, "args"))
+    return next((init_type for init_type in given if init_type is not None), None) == "random"
 
 
 def function_names(function: Callable[..., Any]) -> dict[str, Any]:

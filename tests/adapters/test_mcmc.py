@@ -1,5 +1,7 @@
 """3DGS-MCMC: noise follows the gate, and relocation is never left out."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from cases import SkipAlways, gsplat, run, script
@@ -8,6 +10,7 @@ from lookalikes.splats import log
 
 from skipgs_plug.adapters.gsplat_strategy import strategy_events
 from skipgs_plug.adapters.inria import InriaFamily
+from skipgs_plug.adapters.loop_code import asks_for_random_points
 from skipgs_plug.adapters.mcmc import MCMC
 from skipgs_plug.core import decision
 from skipgs_plug.core.pace import growing, needs
@@ -40,6 +43,14 @@ def test_longer_steps_are_tolerated_where_opacities_are_never_reset():
     assert not MCMC.densification.resets and InriaFamily.densification.resets
     assert not strategy_events(gsplat_runner.MCMCStrategy()).resets
     assert strategy_events(gsplat_runner.DefaultStrategy()).resets
+
+
+def test_the_options_of_the_loop_tell_of_random_points_and_not_their_defaults():
+    random, sfm, other = SimpleNamespace(init_type="random"), SimpleNamespace(init_type="sfm"), SimpleNamespace()
+    assert asks_for_random_points({"dataset": random, "opt": other})
+    assert asks_for_random_points({"args": random})
+    assert not asks_for_random_points({"lp": random, "dataset": sfm, "args": random})
+    assert not asks_for_random_points({"lp": random, "dataset": other})
 
 
 @pytest.mark.parametrize("init_type", ["sfm", "random"])
