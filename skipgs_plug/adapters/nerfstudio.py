@@ -116,6 +116,7 @@ class Nerfstudio(AbstractAdapter):
                 world_size=trainer.world_size,
                 gradients_read_until=read_until,
                 densification=None if survey.unknown else strategy_events(strategy),
+                random_points=begins_at_random(pipeline.model),
             )
         )
 
@@ -168,6 +169,12 @@ def callbacks(trainer: Any) -> Iterator[tuple[Callable[..., Any], int | None]]:
     for callback in trainer.callbacks:
         steps = getattr(callback, "iters", None)
         yield getattr(callback, "func", callback), None if steps is None else max(steps, default=-1) + 1
+
+
+def begins_at_random(model: Any) -> bool:
+    """Return whether a Splatfacto model begins with random points: it was told to, or the scene has no points."""
+    told = getattr(getattr(model, "config", None), "random_init", False)
+    return bool(told) or getattr(model, "seed_points", ()) is None
 
 
 def view_names(files: list[Path]) -> list[str]:

@@ -11,6 +11,7 @@ from lookalikes import nerfstudio
 from lookalikes.splats import log, new_log
 
 from skipgs_plug import AdapterMismatchError, SkipGate, SkipGSError, UnknownTrainerError
+from skipgs_plug.adapters.nerfstudio import begins_at_random
 from skipgs_plug.adapters.registry import find_script_adapter
 from skipgs_plug.core import decision
 
@@ -253,3 +254,16 @@ def test_conditions_of_a_pipeline_are_warned_of():
         warnings.simplefilter("error")
         SkipGate(trainer(), refine_share=0.4, always=[7]).detach()
         SkipGate(trainer(), **RULE).detach()
+
+
+@pytest.mark.parametrize(
+    "model, random",
+    [
+        (types.SimpleNamespace(), False),
+        (types.SimpleNamespace(config=types.SimpleNamespace(random_init=False), seed_points=(1, 2)), False),
+        (types.SimpleNamespace(config=types.SimpleNamespace(random_init=True), seed_points=(1, 2)), True),
+        (types.SimpleNamespace(config=types.SimpleNamespace(random_init=False), seed_points=None), True),
+    ],
+)
+def test_a_model_tells_of_random_points(model, random):
+    assert begins_at_random(model) == random
