@@ -82,7 +82,7 @@ class Growing(Phase):
         self._measuring = True
         self.half_size = HalfSize(config)
         self._fading = False  # whether the points that the scene began with faded
-        self._random = False  # whether they did, or the trainer says that they are random
+        self._told_random = False  # whether the trainer says that they are random
         self._reset: int | None = None  # iteration of the last opacity reset; None without one, or if it is unknown
         self._resets = True  # whether opacities are reset in this phase, or it is not known
         self._whole_from: int | None = None  # iteration from which all run, if no or hardly any refinement follows
@@ -144,7 +144,7 @@ class Growing(Phase):
         if self._unrefined or (self._auto and following <= 0):
             self._whole_from = max(plan.last + 1 - last, self._first)
             self._must |= set(range(self._whole_from, numbers.stop))
-        self._epoch, self._random = plan.epoch or self._epoch, plan.random_points or self._fading
+        self._epoch, self._told_random = plan.epoch or self._epoch, plan.random_points
         self.half_size.begin(plan)
         return True
 
@@ -278,13 +278,12 @@ class Growing(Phase):
         if self._visible is not None:
             # Where opacities are never reset, as in MCMC, a regulariser lets all of them fall.
             self._fading = self._rates.fading.finish() and self.events.resets
-            self._random |= self._fading
             if self._fading and not self._auto:
                 self._warn_of_fading()
         if self._auto:
             longer = self._config.compensates and self._visible is not None
             events = len(self.events) if self.events.all_run else 0
-            shown, moved = self._visible if self._random else None, not self.events.resets
+            shown, moved = self._visible if self._fading or self._told_random else None, not self.events.resets
             self.share = growing_share(self._length, self._epoch, longer, events, shown, self._opacities_recover, moved)
 
     def _warn_of_fading(self) -> None:
@@ -317,7 +316,7 @@ class Growing(Phase):
         positions = geometry_part(factor, LONGEST_STEPS_OF_POSITIONS if far else LONGEST_STEPS_OF_POSITIONS_THAT_STAY)
         if self._unrefined and not self._fading and not self._steps_after:
             return factor, GrowingParts(opacities, positions, scales, True, HIGHEST_OPACITY_RATE)
-        remember = self._random and not events.resets and self._visible < SELDOM_SHOWN
+        remember = self._told_random and not events.resets and self._visible < SELDOM_SHOWN
         return factor, GrowingParts(opacities, positions, scales, events.clears_moments, all_remember=remember)
 
     @property
@@ -358,7 +357,7 @@ class Growing(Phase):
             "opacity_rate_factor": None if parts is None else parts.opacities,
             "times_grown": self._times_grown,
             "fading": self._fading,
-            "random_points": self._random or self._fading,
+            "random_points": self._fading or self._told_random,
             **self.half_size.report(),
             "always_run": {reason: len(numbers) for reason, numbers in self.always.items()},
         }

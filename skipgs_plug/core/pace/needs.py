@@ -252,10 +252,10 @@ def growing_share(
     visits = GROWING_VISITS if resets or not longer else GROWING_VISITS_WITHOUT_RESETS
     steps = LEAST_GROWING_STEPS_LONGER * _longer(iterations) if longer else LEAST_GROWING_STEPS
     from_random = 0.0
-    if shown_of_random:
+    if shown_of_random and moved:
+        from_random = GROWING_SIGHTS_IF_MOVED / shown_of_random
+    elif shown_of_random:
         from_random = max(GROWING_STEPS_FROM_RANDOM, GROWING_SIGHTS_FROM_RANDOM / shown_of_random)
-        if moved:
-            from_random = GROWING_SIGHTS_IF_MOVED / shown_of_random
     needed = max(steps, min(STEPS_PER_EVENT * events, LEAST_GROWING_STEPS), from_random, visits * epoch)
     return min(1.0, max(LEAST_GROWING_SHARE, needed / iterations))
 

@@ -209,6 +209,10 @@ class GrowingParts(NamedTuple):
             return self.scales
         return self.positions if info.named_positions else info.part
 
+    def remembers(self, info: GroupInfo) -> bool:
+        """Whether a group keeps the trainer's beta2."""
+        return self.all_remember or (info.part is None and self.opacities_remember)
+
     def of_opacities(self, rate: float) -> float:
         """Return the multiple of their learning rate `rate` that opacities take."""
         return max(1.0, min(self.opacities, self.highest_opacity_rate / rate)) if rate > 0.0 else self.opacities
@@ -285,12 +289,12 @@ def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
     rows, growing, raised, opacity_rate, positions_rate = division
     if not info.of_gaussians(rows):
         return ScaledGroup(info.group, OTHERS_AT_MOST, 1.0, None) if growing is None else None
+    longer = None if growing is not None and growing.remembers(info) else info
     if info.part is None:
         rate = info.rate
         times = (1.0 if growing is None else growing.of_opacities(rate)) * _recovering(rate, opacity_rate)
         if growing is None or times > 1.0 or (raised and not growing.only_higher_bands):
-            remembers = growing is not None and (growing.opacities_remember or growing.all_remember)
-            return ScaledGroup(info.group, times, 1.0, None if remembers else info)
+            return ScaledGroup(info.group, times, 1.0, longer)
         return None
     if not raised:
         return None
@@ -298,8 +302,7 @@ def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
     if part == 0.0:
         return None
     highest = positions_rate if growing is None and info.named_positions else math.inf
-    remembers = growing is not None and growing.all_remember
-    return ScaledGroup(info.group, part, math.inf, None if remembers else info, highest)
+    return ScaledGroup(info.group, part, math.inf, longer, highest)
 
 
 def _recovering(rate: float, least: float) -> float:
