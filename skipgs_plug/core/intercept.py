@@ -6,7 +6,7 @@ import contextlib
 import functools
 import sys
 import types
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Sequence
 from typing import Any
 
 import torch
@@ -156,9 +156,9 @@ def intercept_tensor_backward(
 ) -> None:
     """Pass scalar backward calls of functions with these names to `gated`.
 
-    `torch.Tensor.backward` is replaced in the whole process. Calls from other functions, such as for a pruning score,
-    and calls on tensors that are not scalars go to the original. The caller of a function `backward` that makes the
-    call, such as `Accelerator.backward` of accelerate, counts as its caller.
+    `torch.Tensor.backward` and `torch.autograd.backward` are replaced in the whole process. Calls from other functions,
+    such as for a pruning score, and calls on tensors that are not one scalar go to the original. The caller of a
+    function `backward` that makes the call, such as `Accelerator.backward` of accelerate, counts as its caller.
 
     Args:
         patches: List of replacements, to which this one is added.
@@ -167,20 +167,25 @@ def intercept_tensor_backward(
         other: Receives the name of another function that calls backward on a scalar, before the call.
     """
 
-    def around(original: Callable[..., Any], loss: torch.Tensor, *args: Any, **kwargs: Any) -> Any:
+    def around(original: Callable[..., Any], tensors: Any, *args: Any, **kwargs: Any) -> Any:
         # Frame 0 is this function, frame 1 the wrapper, frame 2 the caller of backward.
-        frame: types.FrameType | None = sys._getframe(2)
+        called_from = sys._getframe(2)
+        if called_from.f_globals.get("__name__") == "torch._tensor":  # `Tensor.backward` calls that of autograd
+            return original(tensors, *args, **kwargs)
+        frame: types.FrameType | None = called_from
         while frame is not None and frame.f_code.co_name == "backward":
             frame = frame.f_back
-        if frame is None or loss.numel() != 1:
-            return original(loss, *args, **kwargs)
-        if (caller := frame.f_code.co_name) not in callers:
-            if caller != "__torch_function__":  # of a mode such as that of --cpu, inside the call of a function
-                other(caller)
-            return original(loss, *args, **kwargs)
-        return gated(loss, lambda: original(loss, *args, **kwargs))
+        loss = tensors[0] if isinstance(tensors, Sequence) and len(tensors) == 1 else tensors
+        if frame is None or not isinstance(loss, torch.Tensor) or loss.numel() != 1:
+            return original(tensors, *args, **kwargs)
+        if (caller := frame.f_code.co_name) in callers:
+            return gated(loss, lambda: original(tensors, *args, **kwargs))
+        if caller != "__torch_function__":  # of a mode such as that of --cpu, inside the call of a function
+            other(caller)
+        return original(tensors, *args, **kwargs)
 
     patches.wrap(torch.Tensor, "backward", around)
+    patches.wrap(torch.autograd, "backward", around)
 
 
 def _describe(owner: Any) -> str:

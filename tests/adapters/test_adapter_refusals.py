@@ -122,7 +122,7 @@ def train_module(backward):
 
 BACKWARDS = {
     "none": "loss.backward",
-    "other": "torch.autograd.backward(loss)",
+    "other": "torch.autograd.backward([loss, loss])",
     "two": "loss.backward(); render(viewpoint_cam, gaussians)['render'].mean().backward()",
 }
 
@@ -138,6 +138,17 @@ def test_not_one_backward_per_iteration_releases_the_gate_after_ten_and_loses_no
     assert module.done == list(range(1, 41))
     warning = next(one.message for one in seen if one.category is GateWarning)
     assert "8a70a8cd" in str(warning) and "8a70a8cd" in gate.released
+
+
+def test_backward_of_autograd_is_gated_as_that_of_the_loss():
+    gated = []
+    for backward in ("loss.backward()", "torch.autograd.backward(loss)"):
+        module = train_module(backward)
+        with SkipGate(module) as gate:
+            module.training(dataset(), types.SimpleNamespace(iterations=200, densify_until_iter=20), None)
+        assert gate.released is None
+        gated.append(gate.stats()["gated_iterations"])
+    assert gated == [181, 181]
 
 
 def test_script_shorter_than_ten_iterations_is_judged_at_its_end():

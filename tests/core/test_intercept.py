@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import types
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -119,6 +121,36 @@ def test_only_the_training_backward_is_handed_over() -> None:
     assert c.grad is not None
     assert vector.grad is not None
     assert torch.Tensor.backward is original
+
+
+@pytest.mark.parametrize("in_list", [False, True])
+def test_backward_of_autograd_is_handed_over_too(in_list: bool) -> None:
+    patches, seen, others = Patches(), [], []
+
+    def training(loss: torch.Tensor) -> None:
+        torch.autograd.backward([loss] if in_list else loss)
+
+    def score(*losses: torch.Tensor) -> None:
+        torch.autograd.backward(losses)
+
+    original = torch.autograd.backward
+    a, b, c = (torch.ones(1, requires_grad=True) for _ in range(3))
+
+    def gated(loss: torch.Tensor, run: Callable[[], Any]) -> None:
+        seen.append(loss.item())
+        run()
+
+    intercept_tensor_backward(patches, ("training",), gated, others.append)
+    try:
+        training(a.sum())
+        score(b.sum())
+        score(b.sum(), c.sum())
+        globals()["score"](c.sum())
+    finally:
+        patches.restore()
+    assert seen == [1.0] and others == ["score", "score"]
+    assert [one.grad.item() for one in (a, b, c)] == [1.0, 2.0, 2.0]
+    assert torch.autograd.backward is original
 
 
 class Accelerator:
