@@ -138,7 +138,6 @@ class GrowingState(NewerGrowingState):
     asked: float | str
     share: float | None
     first: int | None
-    views: int
     gaussians_shown: tuple[float | None, float | None]  # first and latest measured share
     measuring: bool
     sampling: SamplingState

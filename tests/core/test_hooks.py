@@ -31,7 +31,7 @@ class ScaledTrainer(ToyTrainer):
 def test_gates_counts_and_leaves_nothing_behind() -> None:
     trainer = ToyTrainer()
     with attach(trainer) as gate:
-        assert len(gate.patched) == 9
+        assert len(gate.patched) == 10
         trainer.train()
         gate.verify()
     assert plain(trainer)

@@ -99,7 +99,7 @@ def test_a_state_keeps_the_answer():
         state = gate.state_dict()
     with SkipGate(start_iter=START, share="auto") as again:
         again.load_state_dict(state)
-        assert again.report()["growing"]["fading"]
+        assert again.state_dict()["pace"]["growing"]["fading"]
 
 
 @pytest.mark.parametrize("share, compensate, warned", [(0.3, True, True), (0.5, True, False), (0.3, False, False)])
