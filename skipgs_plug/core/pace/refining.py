@@ -13,13 +13,11 @@ from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, ONE_CYCLE, EarlySto
 from skipgs_plug.core.pace.needs import MOST_RAISED_SHARE, longest_positions, refining_share
 from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates, path_factor
+from skipgs_plug.core.pace.recovery import Recovery
 from skipgs_plug.core.pace.sampling import Sampling
 
 log = logging.getLogger(__name__)
 
-# Largest number of iterations that run after a structural change that comes when refinement has ended, if one visit of
-# each view takes no more. It is as long as the gate's pause (`pause.MIN_PAUSE_ITERS`).
-RECOVERY = 500
 # Reasons for which iterations run.
 OF_SHARE, OF_LOOP, OF_CHANGES = "share", "conditions", "changes"
 
@@ -58,12 +56,7 @@ class Refining(Phase):
         self._last: int | None = None
         self._must: frozenset[int] = frozenset()
         self.ran_for = {OF_SHARE: 0, OF_LOOP: 0, OF_CHANGES: 0}
-        self._recovery = self._recovered = 0  # number of iterations to run after a change, and number that ran
-        self._changed: int | None = None  # iteration of the last change
-        self._most = RECOVERY  # largest number of iterations that run after it
-        self._expected: int | None = None  # iteration in which another change is expected; None if no change is
-        # Number of iterations that had run at the last change before refinement ended, and number that should follow.
-        self._before_change = self._after_change = 0
+        self._recovery = Recovery()
         self._over = False  # whether refinement has ended, for the present iteration
         self._steps_each = False
         self._shrinks = False  # whether the steps, as many as in the trainer's own run, shrink with its schedule
@@ -147,16 +140,13 @@ class Refining(Phase):
             self._enter()
             self._rates.opacity_rate = self._before.opacity_rate
             self._rates.positions_rate = self._positions_rate
-        if self._expected is not None and number > self._expected:
-            assert self._last is not None and self.stopping is not None
-            if self.stopping.ended:
-                self._recover(min(self._most, self._last - self._expected))
-            self._expected = None
+        if self.stopping is not None and self._last is not None:
+            self._recovery.arrive(number, self._last, self.stopping.ended)
         self._set_pace(number)
-        recovers = self._recovered < self._recovery
+        recovers = self._recovery.goes_on
         runs = self.sampling.runs(number in self._must or number == self._last)
         if runs and recovers:
-            self._recovered += 1
+            self._recovery.count()
             self.ran_for[OF_CHANGES] += 1
         elif runs:
             of_share = not self._over and self.ran_for[OF_SHARE] < self.sampling.due
@@ -192,55 +182,12 @@ class Refining(Phase):
         return self._over and not self._removed
 
     def notify_event(self, step: int, n_views: int) -> None:
-        """Take note of a structural change. If refinement has ended, iterations run so that the model recovers.
-
-        A change among the last steps, which are small, is recovered from after refinement.
-
-        The distance to the following change is expected to be that to the previous one. Until then the share of the
-        iterations runs, so that a trainer that prunes again and again still leaves out most iterations. After the last
-        change, or if no change comes as expected, all iterations run, up to `RECOVERY` or one visit of each view. With
-        the share alone, five prunes cost Speedy-Splat 1.1 dB (benchmarks/notes/EVIDENCE.md).
-
-        Args:
-            step: Iteration of the change.
-            n_views: Number of training views; the model recovers for at least one visit of each.
-        """
-        before, self._changed = self._changed, step
-        if self.stopping is None or step == before:
+        """Take note of a structural change in iteration `step`, of a run with `n_views` views; see `Recovery`."""
+        if self.stopping is None:
             return
         assert self._last is not None and self.share is not None
-        self._most = most = max(n_views, RECOVERY)
-        pause, self._expected = self._config.pause_iters, None
-        if pause is not None:
-            iterations = pause
-        elif before is None or self._last - step <= step - before:
-            iterations = min(most, self._last - step)
-        else:
-            self._expected = 2 * step - before
-            iterations = min(most, max(n_views, math.ceil(self.share * (step - before))))
-        if self.stopping.ended:
-            self._recover(iterations)
-        else:
-            self._before_change, self._after_change = self.sampling.run, iterations
-
-    def _recover_from_late_change(self) -> None:
-        """Let iterations run after refinement if a change in the second half of its steps got too few.
-
-        An opacity reset after five sixths of the steps cost FSGS's script 4 dB on fern. Unless another change is
-        expected, they are the last iterations of the schedule: what runs after a later change counts for both.
-        """
-        assert self._last is not None
-        missing = self._after_change - (self.sampling.run - self._before_change)
-        if missing > 0 and self.sampling.run < 2 * self._before_change:
-            if self._expected is None:
-                self._expected = self._last - missing
-            else:
-                self._recover(missing)
-        self._after_change = 0
-
-    def _recover(self, iterations: int) -> None:
-        """Let this number of iterations run from now on."""
-        self._recovery, self._recovered = iterations, 0
+        pause, ran = self._config.pause_iters, self.sampling.run
+        self._recovery.change(step, self._last, self.share, n_views, pause, ran, self.stopping.ended)
 
     @property
     def _positions_rate(self) -> float:
@@ -294,15 +241,14 @@ class Refining(Phase):
                     share, visible = math.sqrt(share), None
                 self._rates.scale(path_factor(share, progress, self._config.rate_peak, visible))
             return
-        if self._recovered >= self._recovery:
+        if not self._recovery.goes_on:
             progress = self.stopping.progress(self.sampling.run / (self.share * (self._last + 1 - self._first)))
             factor = path_factor(self.share, progress, self._config.rate_peak, self._rates.visibility.visible)
             self._over = self.stopping.ended
             if self._over:
-                self._recover_from_late_change()
-        if self._recovered < self._recovery:
-            factor = 1.0 - self._recovered / self._recovery
-            self._over = False
+                self._recovery.after_refinement(self.sampling.run, self._last)
+        if self._recovery.goes_on:
+            factor, self._over = self._recovery.factor, False
         self.sampling.share = 0.0 if self._over else 1.0
         self._rates.scale(factor)
 
@@ -338,11 +284,7 @@ class Refining(Phase):
             "first": self._first,
             "sampling": self.sampling.state_dict(),
             "watched": sorted(self.watched),
-            "recovery": [self._recovery, self._recovered],
-            "changed": self._changed,
-            "expected": self._expected,
-            "most": self._most,
-            "late_change": [self._before_change, self._after_change],
+            **self._recovery.state_dict(),
             "ran_for": dict(self.ran_for),
             "stopping": None if self.stopping is None else self.stopping.state_dict(),
         }
@@ -354,10 +296,7 @@ class Refining(Phase):
         self.share, self._first = share, state["first"]
         self.sampling.load_state_dict(state["sampling"])
         self.watched = frozenset(state["watched"])
-        self._recovery, self._recovered = state["recovery"]
-        self._changed, self._expected = state.get("changed"), state.get("expected")
-        self._most = state.get("most", RECOVERY)
-        self._before_change, self._after_change = state.get("late_change", (0, 0))
+        self._recovery.load_state_dict(state)
         earlier = {OF_SHARE: self.sampling.run}  # earlier states have no counts by reason
         self.ran_for.update({reason: int(count) for reason, count in state.get("ran_for", earlier).items()})
         if state["stopping"] is not None:
