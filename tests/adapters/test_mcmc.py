@@ -13,7 +13,7 @@ from skipgs_plug.adapters.inria import InriaFamily
 from skipgs_plug.adapters.loop_code import asks_for_random_points
 from skipgs_plug.adapters.mcmc import MCMC
 from skipgs_plug.core import decision
-from skipgs_plug.core.pace import growing, needs
+from skipgs_plug.core.pace import growing, growing_steps, needs
 
 CASE = script("mcmc", mcmc)
 
@@ -85,7 +85,7 @@ def test_the_beta2_stays_where_views_show_few_of_the_random_points(init_type, mo
 
     monkeypatch.setattr(torch.optim, "Adam", Adam)
     monkeypatch.setattr(growing, "MEASURED", 2)
-    monkeypatch.setattr(growing, "SELDOM_SHOWN", 1.1)
+    monkeypatch.setattr(growing_steps, "SELDOM_SHOWN", 1.1)
     run(gsplat("mcmc", gsplat_runner.Runner, gsplat_runner.MCMCStrategy, init_type=init_type), share=0.3)
     assert (betas[True] == {0.999}) == (init_type == "random")
     assert 0.98 in betas[False]  # refinement is as ever
