@@ -189,7 +189,9 @@ class Growing(Phase):
         if self._grows_strongly:  # new Gaussians are small by now, and half the size cost bonsai .0014 SSIM
             self.half_size.end(number)
         if self._auto and self._visible is not None:
-            wanted = min(1.0, LEAST_GROWING_SHARE * share_factor(events.growth) * self.stretch)
+            # Where a budget or a share per event sets the number of Gaussians, growth does not tell what a scene needs.
+            share = max(LEAST_GROWING_SHARE * self.stretch, 0.0 if events.all_run else self.share)
+            wanted = min(1.0, share * share_factor(events.growth))
             self._share_now = max(self.share, wanted) if self._has_room(plan, number) else self.share
 
     def _has_room(self, plan: GrowingPlan, number: int) -> bool:
