@@ -9,7 +9,16 @@ from statistics import fmean as mean
 
 import numpy as np
 
-from skipgs_plug.core.pace.needs import for_new_gaussians, growing_share, refining_share
+from skipgs_plug.core.pace.densification_events import DensificationEvents
+from skipgs_plug.core.pace.needs import (
+    LEAST_GROWING_SHARE,
+    MOST_RAISED_SHARE,
+    for_new_gaussians,
+    growing_share,
+    refining_share,
+    share_factor,
+)
+from skipgs_plug.core.trainer_info import Densification
 from skipgs_plug.forecast.pilot import Pilot
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.strategy import reset_interval
@@ -74,11 +83,12 @@ def predict(pilot: Pilot, config: TrainConfig, max_steps: int) -> Forecast:
     costs = [cost(number) for number in numbers]
     per_growing = mean(costs)
     per_refining = cost(grown)
-    longer, resets = pilot.visible is not None, schedule.strategy == "mcmc" or reset_interval(schedule) < stop
-    shown = pilot.visible if pilot.fading else None
-    growing = growing_share(stop, pilot.views, longer, shown_of_random=shown, resets=resets) * stop
-    left = max_steps - stop
-    refining = refining_share(left, pilot.views, grown=stop) * left if left else 0.0
+    resets = schedule.strategy == "mcmc" or reset_interval(schedule) < stop
+    growing = stop * growing_share_of(pilot, config, stop, resets, numbers[-1] / numbers[0])
+    left, refining = max_steps - stop, 0.0
+    if left:
+        share = refining_share(left, pilot.views, grown=stop)
+        refining = left * max(share, min(share * for_new_gaussians(grown / numbers[0]), MOST_RAISED_SHARE))
     more = grown - max(sample.gaussians for sample in pilot.samples)
     memory = None if pilot.peak_memory is None else round(pilot.peak_memory + BYTES_OF_A_GAUSSIAN * max(more, 0.0))
     # Photographs have half their size until the scene grows strongly.
@@ -92,6 +102,32 @@ def predict(pilot: Pilot, config: TrainConfig, max_steps: int) -> Forecast:
         gaussians=round(grown),
         memory=memory,
     )
+
+
+def growing_share_of(pilot: Pilot, config: TrainConfig, stop: int, resets: bool, times_grown: float) -> float:
+    """Return the share of the iterations before the end of densification that `share="auto"` runs.
+
+    Each event is taken to add the same share of the Gaussians; see `core.pace.growing` for the rule.
+
+    Args:
+        pilot: The pilot.
+        config: Its settings.
+        stop: Iteration at which densification ends.
+        resets: Whether opacities must recover meanwhile, from resets or from MCMC's regulariser.
+        times_grown: Number of Gaussians then, as a multiple of those at the beginning.
+    """
+    shown = pilot.visible if pilot.fading else None
+    share = growing_share(stop, pilot.views, pilot.visible is not None, shown_of_random=shown, resets=resets)
+    if config.strategy == "mcmc" or times_grown <= 1.0:
+        return share
+    events = DensificationEvents(range(config.refine_every, stop, config.refine_every), Densification())
+    needed = max(events.needed(config.refine_every, pilot.visible, share, stop), 1)
+    least = max(LEAST_GROWING_SHARE * for_new_gaussians(times_grown), share)
+    raised = share
+    for _ in range(2):  # more iterations run more events, each of which adds less
+        run = min(max(len(events), 1), max(raised * stop / needed, 1.0))
+        raised = max(share, min(least * share_factor(times_grown ** (1.0 / run) - 1.0), MOST_RAISED_SHARE))
+    return raised
 
 
 class Growth:

@@ -81,6 +81,13 @@ def test_a_longer_run_takes_longer_and_auto_takes_less() -> None:
     assert short.memory is not None and short.memory >= 10**9
 
 
+def test_a_scene_whose_events_add_much_runs_more_iterations() -> None:
+    grows = pilot_of(1.0)
+    still = dataclasses.replace(grows, samples=tuple(Sample(one.step, FIRST, 0.01) for one in grows.samples))
+    more, few = (predict(pilot, TrainConfig(), 7000).iterations_auto for pilot in (grows, still))
+    assert 1.2 * few < more < 0.8 * 7000
+
+
 def test_growth_on_smaller_photographs_takes_less() -> None:
     pilot = pilot_of(0.5)
     plain = predict(pilot, TrainConfig(), 7000)

@@ -146,10 +146,10 @@ RARE_SHARE = 0.46
 # Share of the iterations that run if refinement shows each view once, and iterations were left out before it too. On
 # bonsai at 59 visits (30,000 iterations) a share of 0.18 loses nothing, and 0.15 loses 0.2 dB.
 RARE_SHARE_AFTER_FEW = 0.48
-# Least number of visits of each view, if iterations were left out before refinement, and the largest share that runs for
-# them. Bonsai, 255 views at 399x266, ended 0.19 dB (.0045 SSIM) below its own run of 30,000 iterations with 10 visits,
-# and 0.10 dB above it (-.0004) with 15. Plant, 157 views, ended 0.36 dB (.0110) below its own run of 12,000 iterations
-# with 7.5 visits (a fifth), and 0.06 dB (.0036) with 13.6.
+# Least number of visits of each view, if iterations were left out before refinement, and the largest share that runs
+# for them. Bonsai, 255 views at 399x266, ended 0.19 dB (.0045 SSIM) below its own run of 30,000 iterations with 10
+# visits, and 0.10 dB above it (-.0004) with 15. Plant, 157 views, ended 0.36 dB (.0110) below its own run of 12,000
+# iterations with 7.5 visits (a fifth), and 0.06 dB (.0036) with 13.6.
 ENOUGH_VISITS = 15.0
 MOST_SHARE_FOR_VISITS = 0.35
 # Least number of visits of each view in refinement, if iterations were left out before it, for trainers that may lower
