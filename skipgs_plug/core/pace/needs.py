@@ -53,13 +53,13 @@ STEPS_PER_EVENT = 14
 # With 0.03 it had 89 % of its Gaussians and 0.005 less SSIM. Of 7,000 iterations on plant, whose events add 4 %, 812 of
 # 3,500 ended 0.48 dB (.0135 SSIM) below the own run with 72 % of its Gaussians, and 1,239 ended 0.23 dB (.0013) above
 # it with 90 %. Events after fewer iterations bring back the Gaussians, but not the quality.
-GROWTH_PER_EVENT = 0.02
+GROWTH_PER_EVENT = 0.015
 # How much a share is raised for Gaussians that are new: by a part of the logarithm of their number, as a multiple of
 # the number at the beginning. Up to e times as many need nothing more.
 NEW_GAUSSIANS = 1 / 3
-# Largest share of a phase's iterations that run because of new Gaussians. Without a bound, schedules of 3,000 run half
-# of their iterations or more. On fern with 4,000 to 74,000 Gaussians, 1,845 of 3,000 iterations end 0.10 dB higher than
-# 1,201 (seed 0), which end level with the trainer's own run (three seeds). Longer schedules stay below the bound.
+# Largest share of a phase's iterations that run because of new Gaussians, or of many views in refinement. Without a
+# bound, schedules of 3,000 run half of their iterations or more. On fern with 4,000 to 74,000 Gaussians, 1,845 of 3,000
+# iterations end 0.10 dB higher than 1,201 (seed 0), which end level with the trainer's own run (three seeds).
 MOST_RAISED_SHARE = 0.4
 # Number of iterations of growth from which steps need not be longer. With fewer iterations, the factor grows with the
 # square of the lack. Longer schedules reset opacities more often, and the few iterations between two resets do not
@@ -143,15 +143,12 @@ MOST_SHARE_OF_STEPS = 0.8
 # Share of the iterations that run if refinement shows each view once. The share falls with the fourth root of the
 # number of visits. On bonsai, shares of 0.35, 0.3 and 0.25 lose nothing at 2, 6 and 12 visits.
 RARE_SHARE = 0.46
-# Share of the iterations that run if refinement shows each view once, and iterations were left out before it too. On
-# bonsai at 59 visits (30,000 iterations) a share of 0.18 loses nothing, and 0.15 loses 0.2 dB.
-RARE_SHARE_AFTER_FEW = 0.48
-# Least number of visits of each view, if iterations were left out before refinement, and the largest share that runs
-# for them. Bonsai, 255 views at 399x266, ended 0.19 dB (.0045 SSIM) below its own run of 30,000 iterations with 10
-# visits, and 0.10 dB above it (-.0004) with 15. Plant, 157 views, ended 0.36 dB (.0110) below its own run of 12,000
-# iterations with 7.5 visits (a fifth), and 0.06 dB (.0036) with 13.6.
-ENOUGH_VISITS = 15.0
-MOST_SHARE_FOR_VISITS = 0.35
+# The same if iterations were left out before refinement, and the number of visits of each view that is enough then.
+# Without loss or nearly so were 15 of 59 visits on bonsai at 399x266 pixels (30,000 iterations, 255 views), where 10
+# lost 0.19 dB (.0045 SSIM), and 8 of 23 (12,000 iterations). Plant (157 views) lost 0.22 dB (.0091) with 15 of 95 visits
+# and 0.03 dB (.0042) with 24, and 0.36 dB (.0110) with 7 of 38 and 0.06 dB (.0036) with 14. Lego gains with 20 of 150.
+RARE_SHARE_AFTER_FEW = 0.75
+ENOUGH_VISITS = 24.0
 # Least number of visits of each view in refinement, if iterations were left out before it, for trainers that may lower
 # the rate of positions too slowly. Inria's script with 7,000 iterations on 255 views of bonsai at 399 pixels ends 0.44
 # dB (.011 SSIM) below its own run with 3.4 visits, 0.18 dB (.007) with 4.8, and 0.02 dB above it (-.004) with 6.9. The
@@ -213,8 +210,7 @@ def refining_share(iterations: int, epoch: int, grown: int = 0, slow_positions: 
         return min(1.0, max(LEAST_SHARE, LEAST_STEPS / iterations, RARE_SHARE * (epoch / iterations) ** 0.25))
     half = max(iterations, (grown + iterations) / 2)
     steps = max(LEAST_STEPS_AFTER_FEW * _longer(half), LEAST_SHARE_AFTER_FEW * half)
-    visits = RARE_SHARE_AFTER_FEW * (epoch / half) ** 0.25 * half
-    visits = max(visits, min(ENOUGH_VISITS * epoch, MOST_SHARE_FOR_VISITS * half))
+    visits = min(RARE_SHARE_AFTER_FEW * (epoch / half) ** 0.25 * half, ENOUGH_VISITS * epoch, MOST_RAISED_SHARE * half)
     if slow_positions:
         visits = max(visits, REFINING_VISITS * epoch)
         steps = max(steps, min(SHARE_FOR_SLOW_POSITIONS * half, MOST_FOR_SLOW_POSITIONS))
