@@ -27,9 +27,9 @@ POWER_OF_HIDDEN = 0.4
 # view shows a third of the Gaussians, as on bonsai, their number is right without this factor, and with a power of 1/3
 # images of 798x531 pixels end 0.2 dB lower.
 POWER_OF_SHARE = 0.5
-# Largest factor by which an event needs fewer iterations if the one before it added more than `GROWTH_PER_EVENT`. Growth
-# then lacks events rather than noise: plant (157 views, 30,000 iterations) ends with 79 % of its Gaussians with 47
-# iterations per event, and 0.3 dB (.0067 SSIM) higher with 96 % with 38.
+# Largest factor by which an event needs fewer iterations if the one before it added more than `GROWTH_PER_EVENT`. The
+# number of events limits growth then, rather than noise: plant (157 views, 30,000 iterations) ends with 79 % of its
+# Gaussians with 47 iterations per event, and 0.3 dB (.0067 SSIM) higher, with 96 %, with 38.
 SOONER_IN_GROWTH = 1.25
 # Least number of events that run in a shortened phase, even if they need more iterations. A schedule with fewer events
 # keeps all of them. An event at most doubles the number of Gaussians. With 7 or 8 of 13 events, scripts on bonsai at

@@ -144,9 +144,9 @@ MOST_SHARE_OF_STEPS = 0.8
 # number of visits. On bonsai, shares of 0.35, 0.3 and 0.25 lose nothing at 2, 6 and 12 visits.
 RARE_SHARE = 0.46
 # The same if iterations were left out before refinement, and the number of visits of each view that is enough then.
-# Without loss or nearly so were 15 of 59 visits on bonsai at 399x266 pixels (30,000 iterations, 255 views), where 10
-# lost 0.19 dB (.0045 SSIM), and 8 of 23 (12,000 iterations). Plant (157 views) lost 0.22 dB (.0091) with 15 of 95 visits
-# and 0.03 dB (.0042) with 24, and 0.36 dB (.0110) with 7 of 38 and 0.06 dB (.0036) with 14. Lego gains with 20 of 150.
+# Bonsai (255 views at 399x266) lost 0.19 dB (.0045 SSIM) with 10 of 59 visits (30,000 iterations), and nothing with 15
+# of them or with 8 of 23 (12,000 iterations). Plant (157 views) lost 0.22 dB (.0091) with 15 of 95 visits and 0.03 dB
+# (.0042) with 24, and 0.36 dB (.0110) with 7 of 38 and 0.06 dB (.0036) with 14. Lego gained 0.5 dB with 21 of 150.
 RARE_SHARE_AFTER_FEW = 0.75
 ENOUGH_VISITS = 24.0
 # Least number of visits of each view in refinement, if iterations were left out before it, for trainers that may lower
