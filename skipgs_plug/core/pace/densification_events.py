@@ -171,8 +171,8 @@ class DensificationEvents:
         needed = STEPS_BEHIND * (1.0 - visible) ** POWER_OF_HIDDEN
         if not grows_strongly:
             needed *= (share / LEAST_GROWING_SHARE) ** (POWER_OF_SHARE * visible**2)
-        needed /= min(share_factor(self.growth), SOONER_IN_GROWTH)
-        return min(int(needed), math.ceil(share * length / LEAST_EVENTS), distance)
+        needed = min(needed, math.ceil(share * length / LEAST_EVENTS), distance)
+        return int(needed / min(share_factor(self.growth), SOONER_IN_GROWTH))
 
     def _distance(self, number: int) -> int:
         """Return the number of iterations from the previous event to this one in the trainer's own schedule."""

@@ -21,8 +21,8 @@ PART_BY_NAME = {
     **dict.fromkeys((*POSITIONS, *SCALES), GEOMETRY),
 }
 OPACITIES = ("opacity", "opacities")
-# Largest factor on the rate of opacities that must recover from their last reset. They flicker with more.
-MOST_OPACITY_FACTOR = 2.0
+# Largest learning rate of opacities that must recover from their last reset. They flicker with more.
+HIGHEST_RECOVERING_RATE = 0.1
 # Largest factor on the rate of parameters without a row for each Gaussian (exposures, poses, networks). They must not
 # follow a model that is far off for a while.
 OTHERS_AT_MOST = 0.25
@@ -307,7 +307,7 @@ def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
 
 def _recovering(rate: float, least: float) -> float:
     """Return the factor on the rate of opacities that must recover; see `needs.opacity_rate`."""
-    return min(max(least / rate, 1.0), MOST_OPACITY_FACTOR) if rate > 0.0 else 1.0
+    return max(min(least, HIGHEST_RECOVERING_RATE) / rate, 1.0) if rate > 0.0 else 1.0
 
 
 def _is_about(info: GroupInfo, group: dict[str, Any]) -> bool:

@@ -19,7 +19,7 @@ from skipgs_plug.core.pace.needs import (
     longest_positions,
     opacity_rate,
 )
-from skipgs_plug.core.pace.parts import MOST_OPACITY_FACTOR, GrowingParts, rate_of_positions
+from skipgs_plug.core.pace.parts import HIGHEST_RECOVERING_RATE, GrowingParts, rate_of_positions
 from skipgs_plug.core.pace.phase import Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.refining import Refining
@@ -47,12 +47,13 @@ def moved(name, factor, rates, rate=RATE, growing=None, shown=5):
     return -value.detach()[0, 0].item() / rate
 
 
-@pytest.mark.parametrize(("least", "times"), [(0.0, 1.0), (0.5 * RATE, 1.0), (1.5 * RATE, 1.5), (9 * RATE, 2.0)])
-def test_opacities_take_the_rate_that_they_need_in_refinement(least, times, rates):
+@pytest.mark.parametrize(("least", "taken"), [(0.0, 0.025), (0.01, 0.025), (0.05, 0.05), (9.0, 0.1)])
+def test_opacities_take_the_rate_that_they_need_in_refinement(least, taken, rates):
     rates.opacity_rate = least
-    assert times <= MOST_OPACITY_FACTOR
-    assert moved("opacity", 5.0, rates) == pytest.approx(times)
-    assert moved("opacity", 0.5, rates) == pytest.approx(0.5 * times)
+    assert taken <= HIGHEST_RECOVERING_RATE
+    assert moved("opacity", 5.0, rates, rate=0.025) == pytest.approx(taken / 0.025)
+    assert moved("opacity", 0.5, rates, rate=0.025) == pytest.approx(0.5 * taken / 0.025)
+    assert moved("opacity", 5.0, rates, rate=0.2) == pytest.approx(1.0)  # never lower than the trainer's own
 
 
 def test_a_rate_of_positions_that_falls_too_slowly_is_bounded(rates):
@@ -103,7 +104,7 @@ def test_the_end_of_a_run_without_refinement():
     assert last_part(7000, None) == last_part(7000, 300) == 700
     assert last_part(7000, 1000) == last_part(7000, 4000) == MOST_LAST == 1000
     assert last_part(30_000, 3000) == 3000
-    assert opacity_rate(1000) == OPACITY_PATH / 1000 == 0.05
+    assert opacity_rate(2000) == OPACITY_PATH / 2000 == 0.05
 
 
 def test_resets_of_a_strategy_are_known():
