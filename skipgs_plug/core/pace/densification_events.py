@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from skipgs_plug.core.pace.needs import LEAST_GROWING_SHARE, share_factor
+from skipgs_plug.core.pace.needs import LEAST_GROWING_SHARE
 from skipgs_plug.core.pace.visibility import VISIBLE
 from skipgs_plug.core.trainer_info import Densification
 
@@ -27,10 +27,6 @@ POWER_OF_HIDDEN = 0.4
 # view shows a third of the Gaussians, as on bonsai, their number is right without this factor, and with a power of 1/3
 # images of 798x531 pixels end 0.2 dB lower.
 POWER_OF_SHARE = 0.5
-# Largest factor by which an event needs fewer iterations if the one before it added more than `GROWTH_PER_EVENT`. The
-# number of events limits growth then, rather than noise: plant (157 views, 30,000 iterations) ends with 79 % of its
-# Gaussians with 47 iterations per event, and 0.3 dB (.0067 SSIM) higher, with 96 %, with 38.
-SOONER_IN_GROWTH = 1.25
 # Least number of events that run in a shortened phase, even if they need more iterations. A schedule with fewer events
 # keeps all of them. An event at most doubles the number of Gaussians. With 7 or 8 of 13 events, scripts on bonsai at
 # 100x67 ended with half of their Gaussians and 0.011 less SSIM.
@@ -171,8 +167,7 @@ class DensificationEvents:
         needed = STEPS_BEHIND * (1.0 - visible) ** POWER_OF_HIDDEN
         if not grows_strongly:
             needed *= (share / LEAST_GROWING_SHARE) ** (POWER_OF_SHARE * visible**2)
-        needed = min(needed, math.ceil(share * length / LEAST_EVENTS), distance)
-        return int(needed / min(share_factor(self.growth), SOONER_IN_GROWTH))
+        return min(int(needed), math.ceil(share * length / LEAST_EVENTS), distance)
 
     def _distance(self, number: int) -> int:
         """Return the number of iterations from the previous event to this one in the trainer's own schedule."""

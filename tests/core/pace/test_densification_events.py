@@ -58,16 +58,6 @@ def test_growth_is_that_of_the_last_event():
     assert events.grown == 0 and events.growth == 0.0
 
 
-def test_an_event_after_one_that_added_much_needs_fewer_iterations():
-    events = DensificationEvents(range(100, 1001, 100), Densification())
-    events.rows = 1000
-    events.ran(100)
-    found = []
-    for events.rows in (1010, 1018, 1500):  # 1, 1.8 and 50 %
-        found.append(events.needed(200, 0.3, 0.1, 100_000))
-    assert found == [47, 39, 38]  # 55 * 0.7 ** 0.4, divided by 1.2 and by at most 1.25
-
-
 LONG = range(100, 6001, 100)  # 60 events, with 20 iterations for each if every fifth runs
 
 
