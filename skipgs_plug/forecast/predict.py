@@ -11,12 +11,11 @@ import numpy as np
 
 from skipgs_plug.core.pace.densification_events import DensificationEvents
 from skipgs_plug.core.pace.needs import (
-    LEAST_GROWING_SHARE,
-    MOST_RAISED_SHARE,
     for_new_gaussians,
     growing_share,
+    raised_share,
     refining_share,
-    share_factor,
+    share_after_event,
 )
 from skipgs_plug.core.trainer_info import Densification
 from skipgs_plug.forecast.pilot import Pilot
@@ -88,7 +87,7 @@ def predict(pilot: Pilot, config: TrainConfig, max_steps: int) -> Forecast:
     left, refining = max_steps - stop, 0.0
     if left:
         share = refining_share(left, pilot.views, grown=stop)
-        refining = left * max(share, min(share * for_new_gaussians(grown / numbers[0]), MOST_RAISED_SHARE))
+        refining = left * raised_share(share, share * for_new_gaussians(grown / numbers[0]))
     more = grown - max(sample.gaussians for sample in pilot.samples)
     memory = None if pilot.peak_memory is None else round(pilot.peak_memory + BYTES_OF_A_GAUSSIAN * max(more, 0.0))
     # Photographs have half their size until the scene grows strongly.
@@ -122,11 +121,11 @@ def growing_share_of(pilot: Pilot, config: TrainConfig, stop: int, resets: bool,
         return share
     events = DensificationEvents(range(config.refine_every, stop, config.refine_every), Densification())
     needed = max(events.needed(config.refine_every, pilot.visible, share, stop), 1)
-    least = max(LEAST_GROWING_SHARE * for_new_gaussians(times_grown), share)
     raised = share
     for _ in range(2):  # more iterations run more events, each of which adds less
         run = min(max(len(events), 1), max(raised * stop / needed, 1.0))
-        raised = max(share, min(least * share_factor(times_grown ** (1.0 / run) - 1.0), MOST_RAISED_SHARE))
+        growth = times_grown ** (1.0 / run) - 1.0
+        raised = raised_share(share, share_after_event(share, growth, for_new_gaussians(times_grown)))
     return raised
 
 

@@ -13,13 +13,12 @@ from skipgs_plug.core.pace.growing_steps import longer_steps
 from skipgs_plug.core.pace.half_size import HalfSize
 from skipgs_plug.core.pace.needs import (
     LAST_FACTOR,
-    LEAST_GROWING_SHARE,
     MOST_RAISED_SHARE,
     for_new_gaussians,
     growing_share,
     opacity_factor,
     opacity_rate,
-    share_factor,
+    share_after_event,
 )
 from skipgs_plug.core.pace.parts import ONLY_HIGHER_BANDS, UNCHANGED, GrowingParts
 from skipgs_plug.core.pace.phase import Phase, PhasePlan
@@ -189,9 +188,7 @@ class Growing(Phase):
         if self._grows_strongly:  # new Gaussians are small by now, and half the size cost bonsai .0014 SSIM
             self.half_size.end(number)
         if self._auto and self._visible is not None:
-            # Where a budget or a share per event sets the number of Gaussians, growth does not tell what a scene needs.
-            share = max(LEAST_GROWING_SHARE * self.stretch, 0.0 if events.all_run else self.share)
-            wanted = min(1.0, share * share_factor(events.growth))
+            wanted = share_after_event(self.share, events.growth, self.stretch, events.all_run)
             self._share_now = max(self.share, wanted) if self._has_room(plan, number) else self.share
 
     def _has_room(self, plan: GrowingPlan, number: int) -> bool:

@@ -265,6 +265,24 @@ def share_factor(growth: float) -> float:
     return max(1.0, growth / GROWTH_PER_EVENT)
 
 
+def share_after_event(share: float, growth: float, stretch: float, by_budget: bool = False) -> float:
+    """Return the share of the iterations that a densification event asks for until the following one.
+
+    Args:
+        share: Share of the phase.
+        growth: Number of Gaussians that the event added, as a share of those before it.
+        stretch: Result of `for_new_gaussians`.
+        by_budget: Whether a budget or a share per event sets the number of Gaussians. Growth does not tell what the
+            scene needs then, and does not multiply the share of the phase.
+    """
+    return min(1.0, max(LEAST_GROWING_SHARE * stretch, 0.0 if by_budget else share) * share_factor(growth))
+
+
+def raised_share(share: float, wanted: float) -> float:
+    """Return the share of a phase's iterations that runs if new Gaussians ask for `wanted` instead of `share`."""
+    return max(share, min(wanted, MOST_RAISED_SHARE))
+
+
 def for_new_gaussians(times_grown: float | None) -> float:
     """Return the factor on the share of the iterations for Gaussians that densification added, at least 1.
 

@@ -10,7 +10,7 @@ from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import GateStateError
 from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, ONE_CYCLE, EarlyStopping, watched_views, why_none_watched
-from skipgs_plug.core.pace.needs import MOST_RAISED_SHARE, longest_positions, refining_share
+from skipgs_plug.core.pace.needs import longest_positions, raised_share, refining_share
 from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates, path_factor
 from skipgs_plug.core.pace.recovery import Recovery
@@ -131,7 +131,7 @@ class Refining(Phase):
         self._before.end()
         assert self.share is not None
         if self._auto:
-            self.share = max(self.share, min(self.share * self._before.stretch, MOST_RAISED_SHARE))
+            self.share = raised_share(self.share, self.share * self._before.stretch)
             if self.stopping is None:
                 self.sampling.share = self.share
 
