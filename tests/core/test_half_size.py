@@ -8,9 +8,11 @@ import torch
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.half_size import (
     JUDGED,
+    MOST_PIXELS,
     Kept,
     can_be_halved,
     halved,
+    judged_tiles,
     kept_at_half_size,
     psnr_at_half_size,
     some_of,
@@ -49,15 +51,33 @@ def test_photographs_with_fine_detail_lose_more():
     stripes = (torch.arange(64) % 2).float().expand(3, 64, 64)  # half the size is grey
     smooth = torch.linspace(0, 1, 64).expand(3, 64, 64)
     fine, plain, both = (
-        (psnr_at_half_size(images), ssim_at_half_size(images)) for images in ([stripes], [smooth], [smooth, stripes])
+        (psnr_at_half_size(tiles), ssim_at_half_size(tiles)) for tiles in ([stripes], [smooth], [smooth, stripes])
     )
     assert fine[0] == pytest.approx(-10 * math.log10(0.25), abs=1e-3) and fine[1] < 0.1
     assert plain[0] > 45 and plain[1] > 0.99
-    assert both == pytest.approx([(fine[0] + plain[0]) / 2, (fine[1] + plain[1]) / 2])
+    errors = [10 ** (-psnr / 10) for psnr in (fine[0], plain[0])]  # those of the tiles of one photograph
+    assert both == pytest.approx([-10 * math.log10(sum(errors) / 2), (fine[1] + plain[1]) / 2])
     assert math.isfinite(psnr_at_half_size([torch.zeros(3, 30, 30)]))
     # Where the PSNR is too low, SSIM is not computed.
     assert kept_at_half_size(lambda: [stripes]) == (pytest.approx(fine[0]), None)
     assert kept_at_half_size(lambda: [smooth]) == pytest.approx(plain)
+    assert kept_at_half_size(lambda: [smooth, stripes]).psnr == pytest.approx((fine[0] + plain[0]) / 2)
+
+
+@pytest.mark.parametrize("size", [(1500, 2000), (2001, 977), (40, 60_000)])
+def test_large_photographs_are_judged_in_tiles_that_are_spread(size):
+    photograph = torch.arange(size[0] * size[1]).reshape(1, *size).expand(3, *size)
+    tiles = judged_tiles(photograph)
+    assert len(tiles) == 9 and len({tile.shape for tile in tiles}) == 1
+    assert min(tiles[0].shape[1:]) >= 22 and 9 * tiles[0][0].numel() <= 4 * MOST_PIXELS  # a narrow one has wider tiles
+    assert torch.equal(tiles[0][0, 0, 0], photograph[0, 0, 0]) and torch.equal(
+        tiles[-1][0, -1, -1], photograph[0, -1, -1]
+    )
+    middle = tiles[4][0, tiles[4].shape[1] // 2, tiles[4].shape[2] // 2]
+    assert abs(int(middle) // size[1] - size[0] // 2) <= 2 and abs(int(middle) % size[1] - size[1] // 2) <= 2
+    assert not any(tile.untyped_storage().nbytes() > tile.nbytes for tile in tiles)  # the photograph is not kept
+    small = photograph[:, :100, :100]
+    assert judged_tiles(small)[0] is small
 
 
 def test_large_plain_areas_do_not_hide_lost_detail():

@@ -29,8 +29,8 @@ def test_it_is_that_of_torchmetrics(height: int, width: int, noise: float) -> No
     assert ssim(render, target, mask) == pytest.approx(masked, abs=1e-5)
 
 
-def test_bands_of_rows_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     first, second = torch.rand(2, 53, 40, 3, generator=torch.Generator().manual_seed(0))
     whole = ssim_map(first, second)
-    monkeypatch.setattr(ssim_module, "BAND", 40 * 10)  # five bands of 10 rows, and one of 3
+    monkeypatch.setattr(ssim_module, "BLOCK", (10, 16))  # the last ones are 3 rows high and 8 columns wide
     assert torch.equal(ssim_map(first, second), whole)
