@@ -1,13 +1,35 @@
-"""Memory that is left for this process: free memory of the machine, bounded by its control group."""
+"""Memory that is left for this process: free memory of the machine, bounded by its control groups."""
 
 from __future__ import annotations
 
-from pathlib import Path
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
-MEMINFO = "proc/meminfo"
-CGROUP_V2 = ("sys/fs/cgroup/memory.max", "sys/fs/cgroup/memory.current")  # bytes; "max" for no limit
-CGROUP_V1 = ("sys/fs/cgroup/memory/memory.limit_in_bytes", "sys/fs/cgroup/memory/memory.usage_in_bytes")
+MEMINFO, GROUPS = "proc/meminfo", "proc/self/cgroup"
 UNKNOWN = 8 << 30  # bytes of free memory assumed on systems that do not report it, such as macOS and Windows
+
+
+class Version(NamedTuple):
+    """Where a version of control groups has its groups, and the names of the files in each.
+
+    Attributes:
+        controller: Name in the list of the process's groups; version 2 has none.
+        root: Folder of the uppermost group.
+        limit, used: Files with the allowed and the used bytes. A limit can be "max".
+        cache: Entry of memory.stat: bytes of files that the kernel drops when memory is needed. They count as used.
+    """
+
+    controller: str
+    root: str
+    limit: str
+    used: str
+    cache: str
+
+
+V2 = Version("", "sys/fs/cgroup", "memory.max", "memory.current", "inactive_file")
+V1 = Version("memory", "sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
 
 
 def free_memory(root: Path = Path("/")) -> int:
@@ -16,20 +38,48 @@ def free_memory(root: Path = Path("/")) -> int:
     Args:
         root: Folder with `proc` and `sys` of the kernel.
     """
-    found = [size for size in (_available(root), *(_left(root, *names) for names in (CGROUP_V2, CGROUP_V1))) if size]
-    return min(found, default=UNKNOWN)
+    sizes = [_available(root), *(_left(group, version) for version in (V2, V1) for group in _groups(root, version))]
+    return min((size for size in sizes if size is not None), default=UNKNOWN)
 
 
 def _available(root: Path) -> int | None:
     try:
-        lines = (root / MEMINFO).read_text().splitlines()
-        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
-    except (OSError, ValueError, IndexError, StopIteration):
+        return _entry(root / MEMINFO, "MemAvailable:") * 1024
+    except (OSError, ValueError):
         return None
 
 
-def _left(root: Path, limit: str, used: str) -> int | None:
+def _groups(root: Path, version: Version) -> Iterator[Path]:
+    """Return the folders of the groups that hold this process, from the innermost on. Each can have a limit."""
     try:
-        return max(1, int((root / limit).read_text()) - int((root / used).read_text()))
+        lines = [line.split(":", 2) for line in (root / GROUPS).read_text().splitlines()]
+        name = next(path for _, controllers, path in lines if version.controller in controllers.split(","))
+    except (OSError, ValueError, StopIteration):
+        name = "/"
+    inner = PurePosixPath(name.lstrip("/"))
+    # A container can show its own group as the uppermost one, and a name that has no folder in it.
+    return (root / version.root / group for group in (inner, *inner.parents))
+
+
+def _left(group: Path, version: Version) -> int | None:
+    try:
+        left = int((group / version.limit).read_text()) - int((group / version.used).read_text())
     except (OSError, ValueError):  # no limit, or no control groups here
         return None
+    with contextlib.suppress(OSError, ValueError):
+        left += _entry(group / "memory.stat", version.cache)
+    return max(1, left)
+
+
+def _entry(file: Path, name: str) -> int:
+    """Return the number after a name in a file of the kernel.
+
+    Raises:
+        OSError: There is no such file.
+        ValueError: There is no such entry, or no number after it.
+    """
+    for line in file.read_text().splitlines():
+        words = line.split()
+        if len(words) > 1 and words[0] == name:
+            return int(words[1])
+    raise ValueError(f"{file} has no entry {name}.")

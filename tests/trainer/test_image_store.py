@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from PIL import Image
 from scene_folders import write_colmap
 
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer, load_scene
-from skipgs_plug.trainer.free_memory import CGROUP_V1, CGROUP_V2, MEMINFO, UNKNOWN, free_memory
+from skipgs_plug.trainer.free_memory import UNKNOWN, V1, V2, free_memory
 from skipgs_plug.trainer.image_store import ImageStore, StreamedView, one_by_one
 
 PICTURE = 32 * 24 * 4  # bytes of a photograph and its mask
@@ -100,19 +101,51 @@ def test_a_mask_that_leaves_nothing_is_refused(folder: Path) -> None:
         load_scene(folder, images=ImageStore(0))
 
 
-def test_free_memory_is_what_the_control_group_leaves(tmp_path: Path) -> None:
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[[str, str], None]:
+    """A function that writes a file of the kernel."""
+
     def write(name: str, text: str) -> None:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
 
+    return write
+
+
+def test_free_memory_is_what_the_control_groups_leave(tmp_path: Path, write: Callable[[str, str], None]) -> None:
     assert free_memory(tmp_path) == UNKNOWN
-    write(MEMINFO, "MemTotal: 9000000 kB\nMemAvailable:  8000000 kB\n")
+    write("proc/meminfo", "MemTotal: 9000000 kB\nMemAvailable:  8000000 kB\n")
     assert free_memory(tmp_path) == 8_192_000_000
-    write(CGROUP_V2[0], "max\n")
-    write(CGROUP_V2[1], "1000\n")
+    write("sys/fs/cgroup/memory.max", "max\n")
+    write("sys/fs/cgroup/memory.current", "1000\n")
     assert free_memory(tmp_path) == 8_192_000_000
-    write(CGROUP_V2[0], "5000\n")
+    write("sys/fs/cgroup/memory.max", "5000\n")
     assert free_memory(tmp_path) == 4000
-    write(CGROUP_V1[0], "2500\n")
-    write(CGROUP_V1[1], "1000\n")
+    write("sys/fs/cgroup/memory/memory.limit_in_bytes", "2500\n")
+    write("sys/fs/cgroup/memory/memory.usage_in_bytes", "1000\n")
     assert free_memory(tmp_path) == 1500
+    write("sys/fs/cgroup/memory/memory.usage_in_bytes", "3000\n")
+    assert free_memory(tmp_path) == 1
+
+
+@pytest.mark.parametrize(
+    ("listed", "folder", "limit", "used", "cache"),
+    [
+        ("0::/user.slice/job", "", V2.limit, V2.used, V2.cache),
+        ("7:cpu,memory:/user.slice/job", "memory/", V1.limit, V1.used, V1.cache),
+    ],
+)
+def test_files_in_memory_are_free_and_any_group_around_the_process_bounds_it(
+    tmp_path: Path, write: Callable[[str, str], None], listed: str, folder: str, limit: str, used: str, cache: str
+) -> None:
+    write("proc/meminfo", "MemAvailable:  8000000 kB\n")
+    write("proc/self/cgroup", f"12:pids:/\n{listed}\n")
+    group = f"sys/fs/cgroup/{folder}user.slice/"
+    write(f"{group}{limit}", "16000\n")
+    write(f"{group}{used}", "16000\n")
+    assert free_memory(tmp_path) == 1
+    write(f"{group}memory.stat", f"anon 1000\n{cache} 15000\n")
+    assert free_memory(tmp_path) == 15000
+    write(f"{group}job/{limit}", "9000\n")  # the inner one has less left
+    write(f"{group}job/{used}", "2000\n")
+    assert free_memory(tmp_path) == 7000
