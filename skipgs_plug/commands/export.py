@@ -10,17 +10,18 @@ import torch
 from torch import Tensor
 
 from skipgs_plug.commands.options.export import Args
+from skipgs_plug.trainer import compressed_ply
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.files import write_aside
+from skipgs_plug.trainer.frame import is_far
 from skipgs_plug.trainer.ply import write_ply
+from skipgs_plug.view import sog, spz
 from skipgs_plug.view.model import is_antialiased, open_snapshots
-from skipgs_plug.view.sog import position_error, to_sog
-from skipgs_plug.view.spz import POSITION_BITS, to_spz
 
 log = logging.getLogger(__name__)
 
 GSPLATS = {".compressed.ply": "ply_compressed", ".splat": "splat"}  # names for gsplat.export_splats
-OURS = {".spz": to_spz, ".sog": to_sog}
+OURS = {".spz": spz.to_spz, ".sog": sog.to_sog}
 ENDINGS = (*GSPLATS, *OURS, ".ply")
 
 
@@ -36,26 +37,30 @@ def run(args: Args) -> int:
     if ending == ".ply":
         write_ply(splats, out)
     else:
-        if splats["means"].dtype == torch.float64:
-            log.warning(
-                "%s holds positions in single precision: they are rounded by up to %.2g units. A .ply keeps them.",
-                *(out, rounding(splats["means"], ending)),
-            )
-            if ending != ".sog":  # .sog positions are relative to the extent
-                splats["means"] = splats["means"].float()
-        data = OURS[ending](splats, is_antialiased(source)) if ending in OURS else exported(splats, GSPLATS[ending])
+        means = splats["means"]
+        if ending in OURS:
+            data = OURS[ending](splats, is_antialiased(source))
+        else:
+            data = exported({**splats, "means": means.float()}, GSPLATS[ending])
         with write_aside(out) as temporary:
             temporary.write_bytes(data)
+        if means.dtype == torch.float64 or (ending == ".spz" and is_far(means.numpy())):
+            log.warning(
+                "%s: so far from the origin, positions are rounded by up to %.2g units. A .ply keeps them.",
+                *(out, rounding(means, ending, out)),
+            )
     print(f"{len(splats['means']):,} Gaussians, {out.stat().st_size / 2**20:.1f} MiB: {out}")
     return 0
 
 
-def rounding(means: Tensor, ending: str) -> float:
-    """Return the largest distance by which a format moves positions [N, 3]."""
-    largest = float(means.abs().max())
+def rounding(means: Tensor, ending: str, out: Path) -> float:
+    """Return the largest error of a coordinate of positions [N, 3] in a written file, in their units."""
+    if ending == ".spz":
+        return spz.position_error(means)
+    single = float(means.abs().max()) * 2.0**-24
     if ending == ".sog":
-        return max(largest * 2.0**-24, position_error(means))
-    return largest * 2.0 ** -(POSITION_BITS if ending == ".spz" else 24)
+        return max(single, sog.position_error(means))  # readers take the positions as float32
+    return single + (compressed_ply.position_error(out) if ending == ".compressed.ply" else 0.0)
 
 
 def exported(splats: Mapping[str, Tensor], name: str) -> bytes:

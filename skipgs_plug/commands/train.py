@@ -74,10 +74,17 @@ def run(args: Args) -> int:
 
 
 def write_small_file(folder: RunFolder, trainer: Trainer) -> None:
-    """Write the model as a file that is small enough to send, and print how to open it, and its name."""
+    """Write the model as a file that is small enough to send, and print its name.
+
+    A model that does not fit the format is not written, which one sentence says: the run is finished all the same.
+    """
     path = folder.root / f"{folder.root.resolve().name}.spz"
     local = {name: parameter.detach().cpu() for name, parameter in trainer.splats.items()}
-    data = to_spz(trainer.scene.frame.dataset_splats(local), trainer.config.antialiased)
+    try:
+        data = to_spz(trainer.scene.frame.dataset_splats(local), trainer.config.antialiased)
+    except InputError as error:
+        print(f"{path.name} is left out: {error}")
+        return
     with write_aside(path, len(data)) as temporary:
         temporary.write_bytes(data)
     print(f"Open it: {next_command('view', folder.root)}; share it: {path} ({len(data) / 1e6:.1f} MB)")

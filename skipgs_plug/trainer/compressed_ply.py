@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +13,7 @@ CHUNK = 256  # Gaussians that share one set of bounds, as the format says
 Columns = dict[str, np.ndarray]
 MAX_LOGIT = 20.0  # opacity logit that stands for infinity in a file: its opacity is 1 in float32
 XYZ, RGB = ("x", "y", "z"), ("r", "g", "b")
+STEPS = (2047, 1023, 2047)  # steps of x, y and z from the lowest position of a chunk to its highest: 11, 10, 11 bits
 
 
 def is_compressed(vertices: Mapping[str, np.ndarray]) -> bool:
@@ -58,6 +60,15 @@ def decompress(
     return {name: values.astype(np.float32) for name, values in result.items()}
 
 
+def position_error(path: Path) -> float:
+    """Return the largest error by which a file rounds coordinates between the bounds of their chunk, in their units."""
+    from plyfile import PlyData
+
+    chunks = PlyData.read(str(path))["chunk"]
+    extents = [float((chunks[f"max_{axis}"] - chunks[f"min_{axis}"]).max(initial=0.0)) for axis in XYZ]
+    return max(extent / steps / 2 for extent, steps in zip(extents, STEPS, strict=True))
+
+
 def logits(alpha: np.ndarray) -> np.ndarray:
     """Return the logits of opacities in [0, 1] that were stored as bytes, finite at both ends."""
     with np.errstate(divide="ignore"):
@@ -67,7 +78,7 @@ def logits(alpha: np.ndarray) -> np.ndarray:
 def unpack_111011(packed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return three numbers in [0, 1] of 11, 10 and 11 bits."""
     x, y, z = packed >> np.uint32(21), packed >> np.uint32(11) & np.uint32(1023), packed & np.uint32(2047)
-    return x / 2047.0, y / 1023.0, z / 2047.0
+    return x / STEPS[0], y / STEPS[1], z / STEPS[2]
 
 
 def unpack_rotation(packed: np.ndarray) -> list[np.ndarray]:

@@ -128,6 +128,11 @@ class Frame:
         return result
 
 
+def is_far(positions: np.ndarray) -> bool:
+    """Return whether positions [N, 3] are so far from the origin, for their extent, that float32 loses some of them."""
+    return bool(len(positions)) and float(np.abs(positions).max()) > FAR * float(np.ptp(positions, axis=0).max())
+
+
 def frame_of(content: Mapping[str, object]) -> Frame:
     """Return the frame that `as_dict` described; the coordinates of the dataset if there is no entry.
 

@@ -16,7 +16,7 @@ from skipgs_plug.install import next_command
 from skipgs_plug.trainer.compressed_ply import MAX_LOGIT, decompress, is_compressed
 from skipgs_plug.trainer.errors import InputError, MissingFileError, reason
 from skipgs_plug.trainer.files import write_aside
-from skipgs_plug.trainer.frame import FAR
+from skipgs_plug.trainer.frame import is_far
 from skipgs_plug.trainer.lfs import HINT, is_pointer
 from skipgs_plug.trainer.scene import check_points
 from skipgs_plug.trainer.sh0 import colours_of_sh0
@@ -188,8 +188,7 @@ def positions_of(vertices: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return positions [N, 3]: float64 if the file has float64 and float32 would lose precision, else float32."""
     table = np.stack([vertices[name].astype(np.float64) for name in ("x", "y", "z")], axis=1)
     short = table.astype(np.float32)
-    far = len(table) and np.abs(table).max() > FAR * max(float(np.ptp(table, axis=0).max()), 1e-300)
-    return table if far and (short != table).any() else short
+    return table if is_far(table) and (short != table).any() else short
 
 
 def colours_of(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:

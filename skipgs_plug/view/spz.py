@@ -30,7 +30,7 @@ MAGIC, VERSION = 0x5053474E, 2
 HEADER = "<IIIBBBB"  # magic, version, Gaussians, SH degree, fractional bits of positions, flags, reserved
 ANTIALIASED, EXTENDED = 1, 2  # flags
 MOST = 10_000_000  # Gaussians in a file, at most: the authors' own reader refuses more
-POSITION_BITS = 23  # bits of a coordinate without its sign; the format has 24 bits in all
+FARTHEST = 2**23 - 1  # largest coordinate, in units of the model: whole numbers of 24 bits with their sign
 COLOUR_SCALE = 0.15  # factor on constant SH coefficients before 0.5 is added, as the format says
 HIGHEST_DEGREE = 3  # highest SH degree that is read, which is also the highest of this package's models
 # Signs of the coefficients of bands 1 to 3 when y and z change sign: (y z x) (xy yz zz xz xx-yy) (...)
@@ -51,8 +51,12 @@ def to_spz(splats: Mapping[str, Tensor], antialiased: bool = False) -> bytes:
 
     Positions are rounded to 2**-22 of the largest coordinate, but not finer than 2**-24. Opacities, colours, scales and
     rotations take one byte per number, spherical harmonics five bits in the first band and four bits in the others.
+
+    Raises:
+        InputError: A coordinate is larger than the format holds, 8,388,607 units.
     """
     means, scales, colours = (splats[name].numpy().astype(np.float64) for name in ("means", "scales", "sh0"))
+    bits = fractional_bits(means)
     cut = int(((scales < SCALES[0]) | (scales > SCALES[1])).any(axis=1).sum())
     if cut:
         log.warning(
@@ -61,10 +65,7 @@ def to_spz(splats: Mapping[str, Tensor], antialiased: bool = False) -> bytes:
             cut,
         )
     n, higher = len(means), splats["shN"].numpy().astype(np.float32)
-    largest = float(np.abs(means).max(initial=1e-9))
-    bits = min(max(math.floor(math.log2((2**POSITION_BITS - 1) / largest)), 0), 24)
     fixed = np.rint(means * (1.0, -1.0, -1.0) * 2.0**bits).astype("<i4")
-    fixed = fixed.clip(-(2**POSITION_BITS), 2**POSITION_BITS - 1)
     opacities = 255.0 / (1.0 + np.exp(-splats["opacities"].numpy().astype(np.float64)))
     quats = splats["quats"].numpy().astype(np.float64)
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(min=1e-12)
@@ -79,6 +80,29 @@ def to_spz(splats: Mapping[str, Tensor], antialiased: bool = False) -> bytes:
         _bytes(_harmonics(higher)),
     ]
     return gzip.compress(b"".join(parts), mtime=0)
+
+
+def position_error(means: Tensor) -> float:
+    """Return the largest error by which coordinates of positions [N, 3] are rounded, in their units.
+
+    Raises:
+        InputError: A coordinate is larger than the format holds.
+    """
+    return 2.0 ** -(fractional_bits(means.numpy()) + 1)
+
+
+def fractional_bits(means: np.ndarray) -> int:
+    """Return how many bits of a coordinate are behind the point, 0 to 24: as many as the largest one leaves free.
+
+    Raises:
+        InputError: A coordinate is larger than the format holds.
+    """
+    largest = float(np.abs(means).max(initial=1e-9))
+    if largest > FARTHEST:
+        raise InputError(
+            f"A .spz holds coordinates up to {FARTHEST:,}, and this model has {largest:,.0f}; write a .ply or a .sog."
+        )
+    return min(math.floor(math.log2(FARTHEST / largest)), 24)
 
 
 def read_spz(path: Path) -> Spz:

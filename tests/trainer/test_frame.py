@@ -144,7 +144,7 @@ def test_a_run_at_utm_coordinates_is_written_there(tmp_path: Path, tiny_scene: S
     torch.testing.assert_close(again.gaussians["means"], own["means"], rtol=0, atol=1e-5)
     assert main(["train", str(root), "--out", str(run), "--resume", "--gate", *length[:1], "40", *length[2:]]) == 0
     assert main(["export", str(run), str(tmp_path / "out.splat")]) == 0
-    assert "single precision" in caplog.text
+    assert "positions are rounded by up to 0.27 units" in caplog.text
     # A packed scene has the same cameras and points.
     save_packed(load_scene(root), tmp_path / "packed.npz")
     packed, loaded = load_scene(tmp_path / "packed.npz"), load_scene(root)

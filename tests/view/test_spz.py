@@ -11,8 +11,9 @@ import torch
 
 from skipgs_plug.cli import main
 from skipgs_plug.fallback_raster.oracle.torch_reference_projection import spherical_harmonics
+from skipgs_plug.trainer import InputError
 from skipgs_plug.trainer.ply import read_ply
-from skipgs_plug.view.spz import to_spz
+from skipgs_plug.view.spz import position_error, to_spz
 
 FLIP = np.array([1.0, -1.0, -1.0])
 
@@ -62,6 +63,31 @@ def test_what_is_read_back_is_what_was_written(k: int, size: float) -> None:
     assert (
         np.abs((turned * quats).sum(axis=1)).min() > 0.99
     )  # w follows from the length 1, so it is coarse near half a turn
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+def test_the_largest_coordinates_are_kept_and_larger_ones_refused(kind: torch.dtype) -> None:
+    splats = grey_at(torch.tensor([[8_388_607.0, -8_388_607.0, 1.0]], dtype=kind))
+    assert np.array_equal(decode(to_spz(splats))["means"] * FLIP, splats["means"].numpy())
+    for axis in range(3):
+        splats["means"][0, axis] = -8_388_608.0
+        with pytest.raises(InputError, match=r"up to 8,388,607, .* has 8,388,608; write a \.ply or a \.sog"):
+            to_spz(splats)
+        splats["means"][0, axis] = 1.0
+
+
+@pytest.mark.parametrize("largest", [1e-3, 0.7, 129.0, 4_500_000.0])
+def test_the_stated_error_bounds_the_rounding(largest: float) -> None:
+    means = largest * (2 * torch.rand(500, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) - 1)
+    error = np.abs(decode(to_spz(grey_at(means)))["means"] * FLIP - means.numpy()).max()
+    assert 0.9 * position_error(means) < error <= position_error(means)
+
+
+def grey_at(means: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Return the raw parameters of grey Gaussians at these positions [N, 3]."""
+    n = len(means)
+    splats = {"means": means, "quats": torch.ones(n, 4), "scales": torch.zeros(n, 3), "opacities": torch.zeros(n)}
+    return {**splats, "sh0": torch.zeros(n, 1, 3), "shN": torch.zeros(n, 0, 3)}
 
 
 def test_directions_turn_with_the_axes() -> None:
