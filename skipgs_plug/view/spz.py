@@ -31,6 +31,8 @@ HEADER = "<IIIBBBB"  # magic, version, Gaussians, SH degree, fractional bits of 
 ANTIALIASED, EXTENDED = 1, 2  # flags
 MOST = 10_000_000  # Gaussians in a file, at most: the authors' own reader refuses more
 FARTHEST = 2**23 - 1  # largest coordinate, in units of the model: whole numbers of 24 bits with their sign
+# Python's default, 9, writes 171,460 trained Gaussians in 3.7 s instead of 0.7 s, and the file is 1.6 % smaller.
+GZIP_LEVEL = 6
 COLOUR_SCALE = 0.15  # factor on constant SH coefficients before 0.5 is added, as the format says
 HIGHEST_DEGREE = 3  # highest SH degree that is read, which is also the highest of this package's models
 # Signs of the coefficients of bands 1 to 3 when y and z change sign: (y z x) (xy yz zz xz xx-yy) (...)
@@ -79,7 +81,7 @@ def to_spz(splats: Mapping[str, Tensor], antialiased: bool = False) -> bytes:
         _bytes(quats * 127.5 + 127.5),
         _bytes(_harmonics(higher)),
     ]
-    return gzip.compress(b"".join(parts), mtime=0)
+    return gzip.compress(b"".join(parts), GZIP_LEVEL, mtime=0)
 
 
 def position_error(means: Tensor) -> float:
