@@ -17,6 +17,7 @@ from skipgs_plug.install import next_command
 from skipgs_plug.photos import global_mapping
 from skipgs_plug.photos.choices import Mapping
 from skipgs_plug.photos.gather import check_source, gather
+from skipgs_plug.photos.origin import origin_of
 from skipgs_plug.photos.reconstruct import Reconstruction
 from skipgs_plug.photos.scene_folder import check_target, write_scene
 from skipgs_plug.photos.unplaced import explain_unplaced
@@ -55,6 +56,7 @@ def reconstruct(args: Args) -> Path:
 
     try:
         with bar("Reading photographs") as shown:
+            origin = origin_of(photos)
             gathered = gather(photos, work / "photos", args.frames, shown.update)
         count = len(gathered.names)
         reconstruction = Reconstruction(gathered, work)
@@ -67,7 +69,7 @@ def reconstruct(args: Args) -> Path:
         error = models[0].compute_mean_reprojection_error()
         points = models[0].num_points3D()
         with bar("Writing the scene", count - len(unplaced)) as shown:
-            written = write_scene(reconstruction.undistort(models[0]), scene, shown.update)
+            written = write_scene(reconstruction.undistort(models[0]), scene, origin, shown.update)
     finally:
         shutil.rmtree(work, ignore_errors=True)
     print(

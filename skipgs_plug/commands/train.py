@@ -18,6 +18,7 @@ from skipgs_plug.files import write_aside
 from skipgs_plug.garbage import uncollected
 from skipgs_plug.install import next_command
 from skipgs_plug.photos.gather import are_photographs
+from skipgs_plug.photos.origin import check_origin, described
 from skipgs_plug.trainer import InputError, MissingFileError, TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.ahead import prepare_kernels
 from skipgs_plug.trainer.config import REFERENCE_STEPS
@@ -94,14 +95,14 @@ def check(args: Args, checkpoints: list[Path]) -> None:
     """Refuse options that do not fit, before anything is read.
 
     Raises:
-        InputError: LPIPS cannot be computed, --out cannot be a folder, --resume does not fit its content, or --sfm does
-            not fit SCENE.
+        InputError: LPIPS cannot be computed, --out cannot be a folder, --resume does not fit its content, --sfm does
+            not fit SCENE, or the scene in --out was made of other photographs.
         SkipGSError: A setting of the gate is out of its range.
     """
     require_folder(args.out)
     SkipConfig(**args.gate_options.given())
-    given = Path(args.scene).expanduser()
-    reads_photographs = args.sfm and not (args.resume and is_scene(RunFolder(args.out).root / SCENE))
+    given, scene = Path(args.scene).expanduser(), RunFolder(args.out).root / SCENE
+    reads_photographs = args.sfm and not (args.resume and is_scene(scene))
     if reads_photographs and not given.exists():
         raise MissingFileError(f"{args.scene} does not exist; give a video or a folder with photographs.")
     if reads_photographs and not are_photographs(given):
@@ -118,12 +119,16 @@ def check(args: Args, checkpoints: list[Path]) -> None:
         raise InputError(f"{args.out} already holds a run; add --resume to continue it or give another --out.")
     if args.resume and not checkpoints:
         raise MissingFileError(f"{args.out} holds no checkpoint (ckpts/ckpt_*_rank0.pt); start without --resume.")
+    if reads_photographs and is_scene(scene):
+        check_origin(scene, given)
 
 
 def scene_of_photographs(args: Args, folder: RunFolder) -> Path:
     """Return the scene of the run's photographs. It is reconstructed in the run's folder if it is not there yet."""
     scene = folder.root / SCENE
-    if not is_scene(scene):
+    if is_scene(scene):
+        print(described(scene))
+    else:
         from skipgs_plug.commands import sfm  # imports pycolmap, which training does not need
 
         with exclusive(folder.root):

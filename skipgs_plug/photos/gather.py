@@ -51,8 +51,14 @@ def are_photographs(source: Path) -> bool:
         return source.suffix.lower() in VIDEO_SUFFIXES
     if not source.is_dir() or is_scene(source):
         return False
+    return bool(photographs(source))
+
+
+def photographs(folder: Path) -> list[Path]:
+    """Return the photographs in a folder and its subfolders, sorted, also those in formats that cannot be read."""
     known = AS_THEY_ARE + CONVERTED + UNREADABLE
-    return any(path.suffix.lower() in known and not path.name.startswith(".") for path in walk(source))
+    found = [path for path in walk(folder) if path.suffix.lower() in known and not path.name.startswith(".")]
+    return sorted(path for path in found if not path.is_dir())
 
 
 def walk(folder: Path) -> Iterator[Path]:
@@ -120,9 +126,7 @@ def gather_video(source: Path, folder: Path, frames: int, progress: Callable[[in
 
 
 def gather_folder(source: Path, folder: Path, progress: Callable[[int], None]) -> Gathered:
-    known = AS_THEY_ARE + CONVERTED + UNREADABLE
-    found = [path for path in sorted(walk(source)) if path.suffix.lower() in known]
-    files = [path for path in found if not path.is_dir() and not path.name.startswith(".")]
+    files = photographs(source)
     unreadable = [path for path in files if path.suffix.lower() in UNREADABLE]
     if unreadable:
         others = f" ({len(unreadable) - 1} more of this kind)" if len(unreadable) > 1 else ""

@@ -1,4 +1,4 @@
-"""Write a scene as a COLMAP folder: images, images_2, images_4, images_8, sparse/0."""
+"""Write a scene as a COLMAP folder: images, images_2, images_4, images_8, sparse/0, and what it was made of."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 
 from PIL import Image
 
+from skipgs_plug.photos.origin import Origin, write_origin
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.loaders.images import read_image
 from skipgs_plug.trainer.scene import BLACK
@@ -29,12 +30,13 @@ def check_target(scene: Path, source: Path) -> None:
         raise InputError(f"{scene} lies in the folder of the photographs; give a SCENE outside of it.")
 
 
-def write_scene(undistorted: Path, scene: Path, progress: Callable[[int], None]) -> int:
+def write_scene(undistorted: Path, scene: Path, origin: Origin, progress: Callable[[int], None]) -> int:
     """Turn COLMAP's undistorted folder into a scene with reduced copies; return the number of photographs.
 
     Args:
         undistorted: COLMAP's folder. It must be on the file system of `scene`, because the last step moves it there.
         scene: Folder of the scene, which does not exist or is empty.
+        origin: What the scene is made of, which its folder says.
         progress: Called with 1 for each photograph.
     """
     content = undistorted.with_name("scene")
@@ -53,6 +55,7 @@ def write_scene(undistorted: Path, scene: Path, progress: Callable[[int], None])
             options: dict[str, Any] = {} if path.suffix.lower() == ".png" else {"quality": 95, "subsampling": 0}
             Image.fromarray(pixels.numpy()).save(target, **options)
         progress(1)
+    write_origin(origin, content)
     if scene.exists():
         scene.rmdir()  # the folder is empty, and Windows cannot rename onto an existing folder
     os.replace(content, scene)

@@ -20,11 +20,13 @@ from skipgs_plug.commands import sfm
 from skipgs_plug.install import program
 from skipgs_plug.photos import global_mapping, reconstruct
 from skipgs_plug.photos.links import largest_group
+from skipgs_plug.photos.origin import origin_of, read_origin
 from skipgs_plug.photos.progress import counted
 from skipgs_plug.photos.reconstruct import key_pairs
 from skipgs_plug.trainer import load_scene
 from skipgs_plug.view.model import open_model
 
+IMAGES = ("images", "images_2", "images_4", "images_8")
 # imageio-ffmpeg does not close the pipes of a finished decoder; the garbage collector does.
 LEAVES_PIPES = "ignore:unclosed file:ResourceWarning"
 
@@ -50,8 +52,9 @@ def test_photographs_become_a_scene(photos, tmp_path, capsys, monkeypatch, mappi
     placing = "Placing photographs" + (" all at once" if mapping == "global" else "")
     assert f"{placing}: " in captured.err
     assert counted_to[placing] >= 8 if mapping == "incremental" else 3 <= counted_to[placing] <= 6
-    assert sorted(path.name for path in scene.iterdir()) == ["images", "images_2", "images_4", "images_8", "sparse"]
+    assert sorted(path.name for path in scene.iterdir()) == [*IMAGES, "made_of.json", "sparse"]
     assert sorted(path.name for path in scene.parent.iterdir()) == ["fern"]
+    assert read_origin(scene) == origin_of(photos) and len(read_origin(scene).sizes) == 10
     loaded = load_scene(scene)
     assert len(loaded.train) == 7 and len(loaded.test) == 1 and len(loaded.points) > 200
     for factor in (2, 8):
@@ -96,6 +99,7 @@ def test_a_video_is_trained_on_with_one_command(fern, tmp_path, capsys):
     last = shown.splitlines()[-1]
     assert f"{program()} view {run}; share it: {run / 'walk.spz'} (" in last and (run / "walk.spz").is_file()
     assert (run / "scene/sparse/0").is_dir() and (run / "ply/point_cloud_5.ply").is_file()
+    assert read_origin(run / "scene") == (str(video), {"walk.mp4": video.stat().st_size})
     video.unlink()  # resuming needs only the scene
     assert main([*train, "--max-steps", "8", "--sfm", "--resume"]) == 0
     assert "placed" not in capsys.readouterr().out

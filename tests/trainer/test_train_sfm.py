@@ -12,6 +12,7 @@ from scene_folders import write_colmap
 from skipgs_plug.cli import main
 from skipgs_plug.commands import sfm
 from skipgs_plug.commands import train as module
+from skipgs_plug.photos.origin import FILE, origin_of, write_origin
 from skipgs_plug.trainer import Scene
 
 
@@ -21,8 +22,10 @@ def photos(tmp_path: Path, tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -
     write_colmap(tiny_scene, tmp_path / "known")
     photos = Path(shutil.copytree(tmp_path / "known/images/cam", tmp_path / "photos"))
 
-    def reconstruct(args: sfm.Args) -> Path:
-        return Path(shutil.copytree(tmp_path / "known", args.scene))
+    def reconstruct(args: sfm.Args) -> None:
+        shutil.copytree(tmp_path / "known", args.scene)
+        write_origin(origin_of(args.photos), args.scene)
+        print("Reconstructed.")
 
     monkeypatch.setattr(sfm, "reconstruct", reconstruct)
     return photos
@@ -46,3 +49,66 @@ def test_a_model_that_the_small_file_does_not_hold_ends_as_a_finished_run(
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("run.spz is left out: A .spz holds coordinates up to 8,388,607, and this model has 17,8")
     assert (tmp_path / "run/ply/point_cloud_3.ply").is_file() and not list(tmp_path.glob("run/*.spz"))
+
+
+@pytest.fixture
+def stopped(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    """A run folder with the scene of the photographs and no checkpoint, as if the run was killed while it trained."""
+    run = tmp_path / "run"
+    assert train(photos, run) == 0 and "Reconstructed." in capsys.readouterr().out
+    shutil.rmtree(run / "ckpts")
+    return run
+
+
+def test_a_repeated_command_uses_the_scene_again_and_says_so(
+    photos: Path, stopped: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(photos, stopped) == 0
+    shown = capsys.readouterr().out
+    assert f"{stopped / 'scene'} is used again, made of {photos}.\n" in shown and "Reconstructed." not in shown
+
+
+def test_the_scene_of_an_older_version_is_used_again(
+    photos: Path, stopped: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (stopped / "scene" / FILE).unlink()
+    assert train(photos, stopped) == 0
+    assert "scene is used again, which does not say what it was made of.\n" in capsys.readouterr().out
+
+
+def test_the_scene_of_other_photographs_is_refused(
+    photos: Path, stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = Path(shutil.copytree(photos, tmp_path / "other"))
+    assert train(other, stopped) == 2
+    error, scene = capsys.readouterr().err, stopped / "scene"
+    assert f"{scene} was made of {photos}, not of {other}; give another --out, or delete {scene}" in error
+    assert error.count("\n") == 1 and not (stopped / "ckpts").exists()
+    shutil.rmtree(scene)  # as the sentence says
+    assert train(other, stopped) == 0
+
+
+@pytest.mark.parametrize("change", ["added", "removed", "replaced"])
+def test_the_scene_of_photographs_that_have_changed_is_refused(
+    photos: Path, stopped: Path, capsys: pytest.CaptureFixture[str], change: str
+) -> None:
+    first = min(photos.iterdir())
+    if change == "added":
+        shutil.copy(first, photos / "one_more.png")
+    elif change == "removed":
+        first.unlink()
+    else:
+        first.write_bytes(first.read_bytes() + b"\0")
+    assert train(photos, stopped) == 2
+    error = capsys.readouterr().err
+    assert f"{photos} has changed since {stopped / 'scene'} was made of it (files that differ: 1); give" in error
+
+
+def test_a_run_is_resumed_although_photographs_were_added(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(photos, tmp_path / "run") == 0
+    shutil.copy(min(photos.iterdir()), photos / "one_more.png")
+    assert train(photos, tmp_path / "run", "--resume", "--max-steps", "6") == 0
+    shown = capsys.readouterr().out
+    assert f"is used again, made of {photos}." in shown and shown.count("Reconstructed.") == 1
