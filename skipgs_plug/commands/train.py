@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import importlib
 import os
 from pathlib import Path
 from typing import Any
@@ -21,14 +22,17 @@ from skipgs_plug.photos.gather import are_photographs
 from skipgs_plug.photos.origin import check_origin, described
 from skipgs_plug.trainer import InputError, MissingFileError, TrainConfig, Trainer, load_scene
 from skipgs_plug.trainer.ahead import prepare_kernels
+from skipgs_plug.trainer.backend import resolve_backend
 from skipgs_plug.trainer.config import REFERENCE_STEPS
 from skipgs_plug.trainer.curve import LossCurve
 from skipgs_plug.trainer.image_store import ImageStore
 from skipgs_plug.trainer.loaders import is_scene
 from skipgs_plug.trainer.lock import exclusive
 from skipgs_plug.trainer.metrics import require_lpips
+from skipgs_plug.trainer.ply import read_start
 from skipgs_plug.trainer.resume import first_sound, lengths
 from skipgs_plug.trainer.run_folder import SCENE, RunFolder
+from skipgs_plug.trainer.scene import all_held_out
 from skipgs_plug.view.spz import to_spz
 
 
@@ -92,11 +96,11 @@ def write_small_file(folder: RunFolder, trainer: Trainer) -> None:
 
 
 def check(args: Args, checkpoints: list[Path]) -> None:
-    """Refuse options that do not fit, before anything is read.
+    """Refuse options that do not fit, before a scene is read.
 
     Raises:
         InputError: LPIPS cannot be computed, --out cannot be a folder, --resume does not fit its content, --sfm does
-            not fit SCENE, or the scene in --out was made of other photographs.
+            not fit SCENE, the scene in --out was made of other photographs, or see `check_ahead`.
         SkipGSError: A setting of the gate is out of its range.
     """
     require_folder(args.out)
@@ -121,6 +125,25 @@ def check(args: Args, checkpoints: list[Path]) -> None:
         raise MissingFileError(f"{args.out} holds no checkpoint (ckpts/ckpt_*_rank0.pt); start without --resume.")
     if reads_photographs and is_scene(scene):
         check_origin(scene, given)
+    elif reads_photographs:
+        check_ahead(args)
+
+
+def check_ahead(args: Args) -> None:
+    """Refuse before structure from motion, which takes minutes, what training would refuse after it.
+
+    Raises:
+        InputError: The backend cannot run here, --init-ply cannot be read, or all views would be held out.
+        ModuleNotFoundError: A package is not installed that --view or --tensorboard needs.
+    """
+    resolve_backend(args.train.backend)
+    if args.train.init_ply:
+        read_start(args.train.init_ply)
+    if args.train.test_every == 1:
+        raise all_held_out(Path(args.scene))
+    for package, needed in (("viser", args.session.view), ("tensorboard", args.session.tensorboard)):
+        if needed:
+            importlib.import_module(package)
 
 
 def scene_of_photographs(args: Args, folder: RunFolder) -> Path:

@@ -87,6 +87,14 @@ def split_views(views: list[View], test_every: int) -> tuple[list[View], list[Vi
     return [view for i, view in enumerate(views) if i % test_every], test
 
 
+def all_held_out(source: Path) -> InputError:
+    """Return the error to raise when no view is left to train on."""
+    return InputError(
+        f"{source} leaves no training view: every view is held out. Give --test-every 0 (test_every=0) to train on all "
+        "of them."
+    )
+
+
 def assemble_scene(
     source: Path,
     name: str,
@@ -98,11 +106,7 @@ def assemble_scene(
 ) -> Scene:
     """Check views and points, and build the Scene. Errors name `source`."""
     if not train:
-        held_out = "view is" if len(test) == 1 else f"{len(test)} views are"
-        raise InputError(
-            f"{source} leaves no training view: its {held_out} held out. Give --test-every 0 (test_every=0) to train "
-            "on all of them."
-        )
+        raise all_held_out(source)
     names: set[str] = set()
     for view in train + test:
         if view.name in names:

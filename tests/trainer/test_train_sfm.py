@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
+import torch
 from scene_folders import write_colmap
 
 from skipgs_plug.cli import main
@@ -112,3 +114,30 @@ def test_a_run_is_resumed_although_photographs_were_added(
     assert train(photos, tmp_path / "run", "--resume", "--max-steps", "6") == 0
     shown = capsys.readouterr().out
     assert f"is used again, made of {photos}." in shown and shown.count("Reconstructed.") == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--init-ply", "nothing.ply"], "nothing.ply does not exist"),
+        (["--test-every", "1"], "photos leaves no training view: every view is held out. Give --test-every 0"),
+        (["--backend", "gsplat"], "Backend gsplat needs a CUDA device"),
+        (["--view"], "This command needs the package viser"),
+        (["--tensorboard"], "This command needs the package tensorboard"),
+    ],
+)
+def test_what_training_would_refuse_is_refused_before_structure_from_motion(
+    photos: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    options: list[str],
+    sentence: str,
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for package in ("viser", "tensorboard"):
+        monkeypatch.setitem(sys.modules, package, None)  # as if it was not installed
+    assert train(photos, tmp_path / "run", *options) == 2
+    captured = capsys.readouterr()
+    assert sentence in captured.err and captured.err.count("\n") == 1 and "Reconstructed." not in captured.out
+    assert not (tmp_path / "run").exists()
