@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import socket
 import threading
 
 from torch import Tensor
@@ -14,6 +15,10 @@ from skipgs_plug.view.draw import Painter
 from skipgs_plug.view.model import Model, open_model
 from skipgs_plug.view.page import Page, Splats
 from skipgs_plug.view.web.server import WebPage
+
+# Hosts that stand for all addresses of this machine, and an address of each kind that is in no network: it is reserved
+# for documentation.
+ELSEWHERE = {"0.0.0.0": (socket.AF_INET, "192.0.2.1"), "::": (socket.AF_INET6, "2001:db8::1")}
 
 
 class Draw:
@@ -74,5 +79,19 @@ def serve_cameras(model: Model, draw: Draw, args: Args) -> None:
 
 
 def print_address(model: Model, host: str, port: int) -> None:
+    """Print where the page is, for a phone too if the server listens on all addresses."""
+    host = address_in_network(host) if host in ELSEWHERE else host
     host = f"[{host}]" if ":" in host else host  # IPv6
     print(f"{model.name}: http://{host}:{port} (Ctrl-C ends)", flush=True)
+
+
+def address_in_network(host: str) -> str:
+    """Return the address at which others reach this machine, its name without a network; `host` is in `ELSEWHERE`."""
+    family, elsewhere = ELSEWHERE[host]
+    try:
+        # Connecting a UDP socket sends nothing. It chooses the address from which packets would leave.
+        with socket.socket(family, socket.SOCK_DGRAM) as trial:
+            trial.connect((elsewhere, 9))
+            return str(trial.getsockname()[0])
+    except OSError:
+        return socket.gethostname()

@@ -1,9 +1,12 @@
 """Where the page in the browser may listen, and that it hears its visitors."""
 
+import contextlib
+import errno
 import re
 import socket
 import threading
 import urllib.request
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -71,6 +74,31 @@ def test_an_address_of_ipv6_is_served(capsys):
         assert urllib.request.urlopen(url).status == 200
     finally:
         page.stop()
+
+
+@pytest.mark.parametrize("host, address", [("0.0.0.0", "192.168.1.7"), ("::", "2001:db8::7")])
+def test_a_phone_is_told_an_address_that_it_can_open(host, address, monkeypatch, capsys):
+    @contextlib.contextmanager
+    def network(family, kind):
+        assert kind == socket.SOCK_DGRAM  # so nothing is sent
+        assert (family == socket.AF_INET6) == (":" in host)
+        yield SimpleNamespace(connect=lambda to: None, getsockname=lambda: (address, 40000))
+
+    monkeypatch.setattr(socket, "socket", network)
+    print_address(Model("statue", [], None), host, 8080)
+    shown = f"[{address}]" if ":" in address else address
+    assert capsys.readouterr().out == f"statue: http://{shown}:8080 (Ctrl-C ends)\n"
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
+def test_without_a_network_the_name_of_the_machine_is_told(host, monkeypatch, capsys):
+    def fail(*arguments):
+        raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+    monkeypatch.setattr(socket, "socket", fail)
+    monkeypatch.setattr(socket, "gethostname", lambda: "studio")
+    print_address(Model("statue", [], None), host, 8080)
+    assert capsys.readouterr().out == "statue: http://studio:8080 (Ctrl-C ends)\n"
 
 
 def test_a_port_that_is_taken_is_left_to_the_server_which_takes_the_next():
