@@ -92,7 +92,7 @@ def write_small_file(folder: RunFolder, trainer: Trainer) -> None:
         return
     with write_aside(path, len(data)) as temporary:
         temporary.write_bytes(data)
-    print(f"Open it: {next_command('view', folder.root)}; share it: {path} ({len(data) / 1e6:.1f} MB)")
+    print(f"Share it: {path} ({len(data) / 1e6:.1f} MB)")
 
 
 def check(args: Args, checkpoints: list[Path]) -> None:
