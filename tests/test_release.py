@@ -44,6 +44,13 @@ def test_everything_in_the_package_is_ours_or_comes_with_its_licence() -> None:
     assert not missing, f"no licence in license-files lies beside {missing}"
 
 
+def test_the_licence_of_the_package_names_that_of_the_code_of_others() -> None:
+    project = (ROOT / "pyproject.toml").read_text("utf-8")
+    expression = re.search(r'^license = "(.*?)"', project, re.MULTILINE)
+    assert expression and expression[1].split(" AND ") == ["Apache-2.0", "MIT"]
+    assert (ROOT / "skipgs_plug/view/web/supersplat/LICENSE").read_text("utf-8").startswith("MIT License")
+
+
 def is_foreign(path: Path) -> bool:
     if path.suffix not in OWN:
         return True
