@@ -10,7 +10,6 @@ from skipgs_plug.commands.options.session import SessionOptions
 from skipgs_plug.commands.signals import stop_on_signal
 from skipgs_plug.core.report import write_report
 from skipgs_plug.files import WriteError, keep_going
-from skipgs_plug.install import next_command
 from skipgs_plug.terminate import UNREAD
 from skipgs_plug.trainer import InputError, Trainer
 from skipgs_plug.trainer.autosave import Autosave
@@ -123,16 +122,13 @@ class Session:
             stats = self._evaluate(self._failed, keep)
         with keep_going(self._failed):
             self._curve.write(folder.root / "stats" / "train_curve.json")
-        ply = None
         with keep_going(self._failed):
-            ply = folder.write_ply(trainer)
+            print(folder.write_ply(trainer))
         if self._gate is not None:
             with keep_going(self._failed):
                 write_report(self._gate, folder.root / "skipgs.json", frame=trainer.scene.frame.as_dict())
             print(self._gate.summary())
         print(f"{self._described(stats)}; T_total {trainer.t_total:.1f} s, T_post {trainer.t_post:.1f} s")
-        if ply is not None:
-            print(f"{ply}\nNext: {next_command('view', folder.root)}")
 
     def _described(self, stats: dict[str, Any]) -> str:
         net = self._options.lpips_net

@@ -73,13 +73,14 @@ def run(args: Args) -> int:
             + (f", gate active from {gate.config.start_iter:,}" if gate is not None else "")
         )
         code = Session(args.session, folder, trainer, gate, curve).run()
-    if args.sfm and not code:
-        write_small_file(folder, trainer)
+    if not code:
+        shared = small_file(folder, trainer) if args.sfm else ""
+        print(f"Next: {next_command('view', folder.root)}{shared}")
     return code
 
 
-def write_small_file(folder: RunFolder, trainer: Trainer) -> None:
-    """Write the model as a file that is small enough to send, and print its name.
+def small_file(folder: RunFolder, trainer: Trainer) -> str:
+    """Write the model as a file that is small enough to send, and return the words that name it.
 
     A model that does not fit the format is not written, which one sentence says: the run is finished all the same.
     """
@@ -89,10 +90,10 @@ def write_small_file(folder: RunFolder, trainer: Trainer) -> None:
         data = to_spz(trainer.scene.frame.dataset_splats(local), trainer.config.antialiased)
     except InputError as error:
         print(f"{path.name} is left out: {error}")
-        return
+        return ""
     with write_aside(path, len(data)) as temporary:
         temporary.write_bytes(data)
-    print(f"Share it: {path} ({len(data) / 1e6:.1f} MB)")
+    return f"; share it: {path} ({len(data) / 1e6:.1f} MB)"
 
 
 def check(args: Args, checkpoints: list[Path]) -> None:

@@ -47,11 +47,13 @@ def read_origin(scene: Path) -> Origin | None:
 def check_origin(scene: Path, source: Path) -> None:
     """Raise an error if a scene says that it was made of other photographs than those of `source`.
 
+    Photographs with the same names and sizes are the same ones, also where they have been moved.
+
     Raises:
         InputError: It was made of another source, or the source has changed since.
     """
     made, now = read_origin(scene), origin_of(source)
-    if made is None or made == now:
+    if made is None or made.sizes == now.sizes:
         return
     if made.source != now.source:
         what = f"{scene} was made of {made.source}, not of {source}"

@@ -96,9 +96,9 @@ def test_a_video_is_trained_on_with_one_command(fern, tmp_path, capsys):
     assert main([*train, "--max-steps", "6", "--sfm"]) == 0
     shown = capsys.readouterr().out
     assert "photographs placed" in shown and shown.count(f"{program()} view {run}") == 1
-    *_, opened, shared = shown.splitlines()
-    assert opened == f"Next: {program()} view {run}"
-    assert shared.startswith(f"Share it: {run / 'walk.spz'} (") and (run / "walk.spz").is_file()
+    last = shown.splitlines()[-1]
+    assert last.startswith(f"Next: {program()} view {run}; share it: {run / 'walk.spz'} (")
+    assert (run / "walk.spz").is_file()
     assert (run / "scene/sparse/0").is_dir() and (run / "ply/point_cloud_5.ply").is_file()
     assert read_origin(run / "scene") == (str(video), {"walk.mp4": video.stat().st_size})
     video.unlink()  # resuming needs only the scene

@@ -48,8 +48,9 @@ def test_a_model_that_the_small_file_does_not_hold_ends_as_a_finished_run(
 
     monkeypatch.setattr(module, "load_scene", far)
     assert train(photos, tmp_path / "run") == 0
-    last = capsys.readouterr().out.splitlines()[-1]
-    assert last.startswith("run.spz is left out: A .spz holds coordinates up to 8,388,607, and this model has 17,8")
+    *_, left_out, last = capsys.readouterr().out.splitlines()
+    assert left_out.startswith("run.spz is left out: A .spz holds coordinates up to 8,388,607, and this model has 17,8")
+    assert last.startswith("Next: ") and "share it" not in last
     assert (tmp_path / "run/ply/point_cloud_3.ply").is_file() and not list(tmp_path.glob("run/*.spz"))
 
 
@@ -82,12 +83,20 @@ def test_the_scene_of_other_photographs_is_refused(
     photos: Path, stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = Path(shutil.copytree(photos, tmp_path / "other"))
+    max(other.iterdir()).unlink()
     assert train(other, stopped) == 2
     error, scene = capsys.readouterr().err, stopped / "scene"
     assert f"{scene} was made of {photos}, not of {other}; give another --out, or delete {scene}" in error
     assert error.count("\n") == 1 and not (stopped / "ckpts").exists()
     shutil.rmtree(scene)  # as the sentence says
     assert train(other, stopped) == 0
+
+
+def test_the_scene_of_photographs_that_were_moved_is_used_again(
+    photos: Path, stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(photos.rename(tmp_path / "moved"), stopped) == 0
+    assert "Reconstructed." not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("change", ["added", "removed", "replaced"])
