@@ -55,9 +55,11 @@ def to_spz(splats: Mapping[str, Tensor], antialiased: bool = False) -> bytes:
     rotations take one byte per number, spherical harmonics five bits in the first band and four bits in the others.
 
     Raises:
-        InputError: A coordinate is larger than the format holds, 8,388,607 units.
+        InputError: A coordinate is larger than the format holds, 8,388,607 units, or there are too many Gaussians.
     """
     means, scales, colours = (splats[name].numpy().astype(np.float64) for name in ("means", "scales", "sh0"))
+    if len(means) > MOST:
+        raise InputError(f"A .spz holds {MOST:,} Gaussians, and this model has {len(means):,}; write a .ply or a .sog.")
     bits = fractional_bits(means)
     cut = int(((scales < SCALES[0]) | (scales > SCALES[1])).any(axis=1).sum())
     if cut:

@@ -13,6 +13,7 @@ from skipgs_plug.cli import main
 from skipgs_plug.fallback_raster.oracle.torch_reference_projection import spherical_harmonics
 from skipgs_plug.trainer import InputError
 from skipgs_plug.trainer.ply import read_ply
+from skipgs_plug.view import spz
 from skipgs_plug.view.spz import position_error, to_spz
 
 FLIP = np.array([1.0, -1.0, -1.0])
@@ -74,6 +75,13 @@ def test_the_largest_coordinates_are_kept_and_larger_ones_refused(kind: torch.dt
         with pytest.raises(InputError, match=r"up to 8,388,607, .* has 8,388,608; write a \.ply or a \.sog"):
             to_spz(splats)
         splats["means"][0, axis] = 1.0
+
+
+def test_more_gaussians_than_readers_take_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(spz, "MOST", 3)
+    to_spz(grey_at(torch.rand(3, 3)))
+    with pytest.raises(InputError, match=r"holds 3 Gaussians, and this model has 4; write a \.ply or a \.sog"):
+        to_spz(grey_at(torch.rand(4, 3)))
 
 
 @pytest.mark.parametrize("largest", [1e-3, 0.7, 129.0, 4_500_000.0])
