@@ -184,7 +184,7 @@ class Engine:
         self.clock.open(post)
 
     def gate(
-        self, view: str, signal: float | Tensor, run: Callable[[], Any], loss: Tensor, alone: bool = False
+        self, view: str, signal: float | Tensor, run: Callable[[], Any], loss: Tensor, frees_graph: bool = False
     ) -> bool:
         """Call `run`, a real backward pass, unless it is skipped; return True if gradients were computed and kept.
 
@@ -196,7 +196,7 @@ class Engine:
             signal: Value to decide by. A loss that a scaler has scaled stands for the loss before.
             run: The backward pass.
             loss: The tensor whose backward pass runs.
-            alone: Whether the iteration has no other backward pass, so that a skipped graph can be freed at once.
+            frees_graph: Whether nothing needs the graph after the backward pass, so that a skip can free it at once.
         """
         now = self.iteration
         if not now.gated:
@@ -216,7 +216,7 @@ class Engine:
                 self.rates.ran()
             else:
                 self._skipped.append(weakref.ref(loss))
-                if alone:
+                if frees_graph:
                     self.free_skipped()
         self.clock.mark()
         return not skip
