@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from skipgs_plug.core.caution import cautioned
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 
 Around = Callable[..., Any]  # called as around(original, *args, **kwargs) in place of original(*args, **kwargs)
@@ -119,10 +120,14 @@ class Patches:
         self._undo.append((label, undo))
 
     def restore(self) -> None:
-        """Undo all changes, the latest first. Further calls do nothing."""
+        """Undo all changes, the latest first. Further calls do nothing.
+
+        An undo may fail, because other code has changed the same thing. The user is warned, and the others follow.
+        """
         while self._undo:
-            _, undo = self._undo.pop()
-            undo()
+            label, undo = self._undo.pop()
+            with cautioned(f"Putting back {label}"):
+                undo()
 
     def _set(self, owner: Any, name: str, value: Any, label: str) -> None:
         if isinstance(owner, dict):

@@ -79,6 +79,15 @@ def test_a_name_that_somebody_else_removed_keeps_nothing_from_being_put_back() -
     assert player.play() == 3
 
 
+def test_an_undo_that_fails_is_warned_of_and_the_others_follow() -> None:
+    original, patches = Base.work, Patches()
+    patches.wrap(Base, "work", twice)
+    patches.add_undo("the middle", [].pop)
+    with pytest.warns(RuntimeWarning, match=r"Putting back the middle failed \(IndexError"):
+        patches.restore()
+    assert patches.names == [] and Base.work is original
+
+
 def test_second_gate_is_refused() -> None:
     first, second = Patches(), Patches()
     first.wrap(Base, "work", twice)
