@@ -77,7 +77,7 @@ class Hooks(LoopHooks):
         self._adapter, self._given = adapter, given
         self._release, self._iteration = engine.release, engine.iteration
         self._release.undoes(self.restore)
-        self._release.refuses = lambda: max(self._iterations, self._backwards) <= 1  # nothing is lost yet
+        self._release.refuses = lambda: not self._has_trained
         self._release.in_script, self._release.attached = in_script, True
         self._guarded = self._release.guarded(lambda: self._iteration.step)
         self._ready = False
@@ -303,6 +303,11 @@ class Hooks(LoopHooks):
     def trained(self) -> bool:
         """Whether an iteration was seen, or a training backward pass outside of any iteration."""
         return self._iterations + self._backwards > 0
+
+    @property
+    def _has_trained(self) -> bool:
+        """Whether a refusal would lose trained iterations, or an earlier stage of the script."""
+        return max(self._iterations, self._backwards) > 1 or self._elsewhere.trained
 
     @property
     def released(self) -> bool:
