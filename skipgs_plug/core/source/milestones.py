@@ -28,7 +28,7 @@ from skipgs_plug.core.source.conditions import (
     position,
     unconditional,
 )
-from skipgs_plug.core.source.counters import counters, counts_in
+from skipgs_plug.core.source.counters import counters, counts_in, only_gathers
 from skipgs_plug.core.source.evaluator import DependsOnLoop, Evaluator, places_in
 from skipgs_plug.core.source.functions import value_of
 from skipgs_plug.core.source.inlining import InlinedFunction, InlinedFunctions
@@ -71,7 +71,9 @@ class TrainingLoop:
         Plain(code).visit_all(statement.body)
         Stored(lambda place: value_of(place, self._names, ())).visit_all(statement.body)
         own, project = assignments_in(statement.body).possible(self._names), Project(code, self._names)
-        self._counters, self._set_back = counters(statement.body, self._names, own.assigned, project)
+        self._counters, back = counters(statement.body, self._names, own.assigned, project)
+        self._gathers = {position(one.test) for one in back if only_gathers(one)}
+        self._sets_back = {position(one.test) for one in back}
         functions = InlinedFunctions(
             statement.body,
             code,
@@ -232,11 +234,12 @@ class TrainingLoop:
         """Yield all conditions on a counter of the loop's own, or of a function, which misses left-out iterations."""
         lines: set[str] = set()
         for condition in self._all:
-            sets_back = condition.function is None and position(condition.test) in self._set_back
-            if sets_back or any(self._evaluator.is_off(guard) for guard in condition.guards):
+            place = position(condition.test) if condition.function is None else None
+            if place in self._gathers or any(self._evaluator.is_off(guard) for guard in condition.guards):
                 continue
             for leaf in leaves(condition.test):
-                picks = isinstance(leaf, (ast.Compare, ast.BinOp)) and is_point(leaf)
+                # A limit at which a counter begins anew picks single numbers, too.
+                picks = isinstance(leaf, (ast.Compare, ast.BinOp)) and (is_point(leaf) or place in self._sets_back)
                 if picks and counts_in(leaf) & self._counters and not self._evaluator.mentions(leaf):
                     lines.add(self._where(condition))
                     yield condition._replace(test=leaf)
