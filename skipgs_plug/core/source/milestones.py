@@ -17,7 +17,7 @@ from typing import Any
 
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.source.assignments import assignments_in
+from skipgs_plug.core.source.assignments import Assignments, assignments_in
 from skipgs_plug.core.source.bindings import assigned_values
 from skipgs_plug.core.source.conditions import (
     Condition,
@@ -70,8 +70,8 @@ class TrainingLoop:
         self._target = target = statement.target.id
         Plain(code).visit_all(statement.body)
         Stored(lambda place: value_of(place, self._names, ())).visit_all(statement.body)
-        own, project = assignments_in(statement.body).possible(self._names), Project(code, self._names)
-        self._counters, back = counters(statement.body, self._names, own.assigned, project)
+        every, project = assignments_in(statement.body).possible(self._names), Project(code, self._names)
+        self._counters, back = counters(statement.body, self._names, every.assigned, project)
         self._gathers = {position(one.test) for one in back if only_gathers(one)}
         self._sets_back = {position(one.test) for one in back}
         functions = InlinedFunctions(
@@ -80,18 +80,25 @@ class TrainingLoop:
             self._names,
             target,
             self._counters,
-            set(own.assigned).difference(known),
+            set(every.assigned).difference(known),
             pure | PURE,
         )
-        inlined = assignments_in(functions).possible(self._names)
-        by_loop = own.changed.difference(known)
-        changing = by_loop.union(functions.unknown, inlined.changed).difference(known)
-        no_options = changing.union({target}, own.options, inlined.options)
-        options = RunOptions(code, around, self._names, no_options, functions.shared, pure | PURE)
+        by_functions = functions.unknown.difference(every.assigned)
+
+        def evaluators(own: Assignments, inlined: Assignments) -> Iterator[Evaluator]:
+            """Yield the evaluator, and one for which functions change no value."""
+            changing = own.changed.union(by_functions, inlined.changed).difference(known)
+            no_options = changing.union({target}, own.options, inlined.options)
+            options = RunOptions(code, around, self._names, no_options, functions.shared, pure | PURE)
+            yield Evaluator(target, functions.counted, self._names, changing, options)
+            yield Evaluator(target, (), self._names, own.changed.difference(known), options)
+
+        # What stands behind an option that is off changes nothing.
+        is_off = next(evaluators(every, assignments_in(functions).possible(self._names))).is_off
+        own, inlined = (assignments_in(one, is_off).possible(self._names) for one in (statement.body, functions))
+        self._evaluator, self._evaluator_of_loop = evaluators(own, inlined)
         counted = decisions_by_count(self._body, self._names, project)
         self._decisions_by_count = [Condition(test, (), InlinedFunction([], one, {})) for test, one in counted]
-        self._evaluator = Evaluator(target, functions.counted, self._names, changing, options)
-        self._evaluator_of_loop = Evaluator(target, (), self._names, by_loop, options)
         self._inner = set(inner_values(statement.body))
         self._bar_ifs = outermost_bar_ifs(statement.body, names, around)
         times = Counter([*own.assigned, *inlined.assigned])
