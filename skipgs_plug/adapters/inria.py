@@ -281,10 +281,13 @@ class InriaFamily(MarkedScript):
         number = "iteration" if self._code is None else self._code.number
         missing = [name for name in (OPTIONS, number) if name not in loop]
         if scene is None or missing:
-            raise self.mismatch(f"{', '.join(missing or self.scenes)} among the variables of {LOOP}()")
+            wanted = ", ".join(missing or self.scenes)
+            raise self.mismatch(f"{wanted} among the variables of {LOOP}() (give the script's own these names)")
         opt, self._step, cameras = loop[OPTIONS], int(loop[number]), scene.getTrainCameras()
         if self.output_folder is None:  # a second run is not gated, and the report tells of the first
             self.output_folder = getattr(scene, "model_path", None)
+        if not all(hasattr(camera, self._label) for camera in cameras):
+            raise self.mismatch(f"cameras with an attribute {self._label}, by which it tells views apart")
         if len({camera.image_name for camera in cameras}) < len(cameras):
             caution(
                 "Several training images have the same name; the gate tells views apart by their position, "

@@ -124,6 +124,10 @@ class Engine:
                 f"start_iter={self.start} is too early: up to iteration {read_until} this trainer's "
                 "densification reads the gradients; start there or later, or leave start_iter out."
             )
+        last = max(config.always or (0,))
+        if config.enabled and info.max_steps is not None and last > info.max_steps:
+            sentence = f"iteration {last}, and the run ends with {info.max_steps}; leave it out"
+            raise SkipGSError(f"always names {sentence}.", in_script=f"--always names {sentence}.")
         if info.view_names is not None:
             self._view_names = require_unique(info.view_names)
         if config.enabled and info.max_steps is not None and self.start > info.max_steps:

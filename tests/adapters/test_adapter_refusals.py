@@ -245,6 +245,24 @@ def test_user_adapter_of_a_fork_is_asked_first(mine):
     assert copy.copy(adapter_names())[0] == "reference"
 
 
+def test_cameras_without_a_name_are_refused_with_the_name():
+    module = train_module("loss.backward()")
+
+    class Nameless(Scene):
+        def getTrainCameras(self):
+            return [types.SimpleNamespace(original_image=one.original_image) for one in super().getTrainCameras()]
+
+    module.Scene = Nameless
+    with SkipGate(module), pytest.raises(AdapterMismatchError, match="expects cameras with an attribute image_name"):
+        module.training(dataset(), types.SimpleNamespace(iterations=5, densify_until_iter=2), None)
+
+
+def test_an_iteration_after_the_run_cannot_be_named():
+    module = train_module("loss.backward()")
+    with SkipGate(module, share=0.5, always=[4, 9]), pytest.raises(SkipGSError, match="names iteration 9, and the run"):
+        module.training(dataset(), types.SimpleNamespace(iterations=5, densify_until_iter=2), None)
+
+
 MARKS = ["num_depth", "depth_reinit", "OptimizingSpa", "compute_edge_score", "set_coarse_interval"]
 
 

@@ -215,11 +215,12 @@ class TrainingLoop:
         hits = _rarer(self._evaluator_of_loop, condition, numbers)
         if hits is None and not others_named:
             text, line = ast.unparse(condition.test), line_in_file(condition.test, self._code)
-            raise SkipGSError(
+            sentence = (
                 f"Line {line} of {self._code.co_filename} has a condition on the iteration's number that cannot be "
                 f"evaluated ahead ({text}), so an iteration that it needs could be left out; use the gate without a "
-                f"share, or {BY_ALWAYS}."
+                "share, or name the iterations that must run"
             )
+            raise SkipGSError(f"{sentence} (always=).", in_script=f"{sentence} (--always).")
         return hits
 
     def _only_numbers(self, condition: Condition, numbers: range) -> set[int] | None:
