@@ -21,6 +21,7 @@ class AbsGS(InriaFamily):
     left_alone = "Blend weights are gathered in skipped iterations too, since they come from the forward."
     stand_ins = "absgs"
     mark = "use_prune_weight"
+    needs = ("prune_until_iter",)
     changes = (*InriaFamily.changes, "reduce_opacity")
     calls = ("initial_prune",)
 

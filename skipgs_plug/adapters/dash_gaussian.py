@@ -21,4 +21,5 @@ class DashGaussian(InriaFamily):
     mark = "TrainingScheduler"
     changes = (*InriaFamily.changes, "prune_and_densify")
     arguments = ("render_size",)
+    pure = ("get_res_scale",)  # it goes on to the level of its number, however many numbers are left out before
     densification = Densification(marks=("densification_interval",), reset_marks=RESETS, needs="nothing")

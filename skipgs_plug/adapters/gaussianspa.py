@@ -30,6 +30,7 @@ class GaussianSpa(InriaFamily):
     )
     stand_ins = "gaussianspa"
     mark = "OptimizingSpa"
+    needs = ("optimizing_spa_start_iter", "optimizing_spa_stop_iter", "optimizing_spa_interval")
     changes = (*InriaFamily.changes, "densify_and_prune_split")
     renders = ("render_imp", "render")
     structural = (*InriaFamily.structural, "reinitial_pts")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Callable, Sequence
 from importlib.abc import MetaPathFinder
@@ -33,7 +34,12 @@ def when_imported(hooks: Hooks, name: str, call: Callable[[ModuleType], None]) -
     hooks.awaited.add(f"module {name}")
     finder = _Finder(name, guarded)
     sys.meta_path.insert(0, finder)
-    hooks.on_detach(f"sys.meta_path ({name})", lambda: sys.meta_path.remove(finder))
+
+    def undo() -> None:
+        with contextlib.suppress(ValueError):  # the script removed it itself
+            sys.meta_path.remove(finder)
+
+    hooks.on_detach(f"sys.meta_path ({name})", undo)
 
 
 class _Finder(MetaPathFinder):

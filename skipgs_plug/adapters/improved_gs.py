@@ -28,6 +28,7 @@ class ImprovedGS(InriaFamily):
     with_share = f"All events are kept. {GROWS_WHOLE}"
     stand_ins = "improved_gs"
     mark = "compute_edge_score"
+    needs = ("optimizer_type",)
     changes = (*InriaFamily.changes, "densify_and_prune_Improved")
     calls: ClassVar[tuple[str, ...]] = ("add_densification_stats_abs",)
     arguments = ("pixel_weights",)

@@ -18,12 +18,12 @@ from typing import Any, ClassVar
 
 import torch
 
-from skipgs_plug.adapters import registry
-from skipgs_plug.adapters.base import AbstractAdapter, gate_backwards_only
+from skipgs_plug.adapters.base import gate_backwards_only
 from skipgs_plug.adapters.half_size_cameras import HalfSizeCameras
 from skipgs_plug.adapters.import_hook import when_imported
 from skipgs_plug.adapters.loop_bounds import READS_GRADIENT, SETS_END, read_loops
 from skipgs_plug.adapters.loop_code import LOOP, OPTIONS, LoopCode, asks_for_random_points, names_around, namespace_of
+from skipgs_plug.adapters.marks import MarkedScript
 from skipgs_plug.adapters.unknown_forks import (
     BY_HAND,
     CALLS,
@@ -49,11 +49,10 @@ RESETS = ("opacity_reset_interval",)  # option that the condition of opacity res
 GROWS_WHOLE = "If steps accumulate gradients after densification, it runs whole."  # with `share`; see `Phased`
 
 
-class InriaFamily(AbstractAdapter):
+class InriaFamily(MarkedScript):
     """Base of Inria 3DGS and its forks: only the backward is gated, and optimizers keep their schedules.
 
     Attributes:
-        mark: A name that only this fork's training scripts have, or only their loop uses.
         renders: Names of the functions that render a training view. At least one must exist.
         structural: Methods of `GaussianModel` that make losses jump.
         scenes: Possible names of the loop's variable for its Scene.
@@ -68,7 +67,6 @@ class InriaFamily(AbstractAdapter):
         known_names: Values of names that the loop assigns, if they are known before it. `begin` fills them.
     """
 
-    mark: ClassVar[str] = ""
     renders: ClassVar[tuple[str, ...]] = ("render",)
     structural: ClassVar[tuple[str, ...]] = ("prune_points", "reset_opacity", "training_setup")
     scenes: ClassVar[tuple[str, ...]] = ("scene",)
@@ -93,28 +91,6 @@ class InriaFamily(AbstractAdapter):
         self._unknown = Unrecognised(*5 * (frozenset(),))
         self._densifies = True  # False if options keep the loop from densification, as LangSplat's
         self._cameras: HalfSizeCameras | None = None  # None if they cannot be shown at half their size
-
-    @classmethod
-    def matches(cls, trainer: Any) -> bool:
-        names = namespace_of(trainer)
-        return (
-            names is not None
-            and {LOOP, "GaussianModel"} <= names.keys()
-            and cls.recognises_script(LoopCode.of_module(names))
-        )
-
-    @classmethod
-    def recognises_script(cls, code: LoopCode) -> bool:
-        return bool(code.used) and "GaussianModel" in code.names and cls.recognises(code.names)
-
-    @classmethod
-    def recognises(cls, names: Container[str]) -> bool:
-        """Whether a training script with these names belongs to this trainer. Adapters before it in the registry win.
-
-        Args:
-            names: Its global names, and all names and attributes that its function `training` uses.
-        """
-        return cls.mark in names
 
     def examine(self, code: LoopCode, renderers: Sequence[Callable[..., Any]], model: type) -> None:
         """Look for parts that this adapter does not know, before training begins: refuse them, or name them.
@@ -172,7 +148,7 @@ class InriaFamily(AbstractAdapter):
         if names is None or LOOP not in names or "GaussianModel" not in names:
             raise self.mismatch(f"a train module with {LOOP}() and GaussianModel, or its {LOOP} function")
         code = LoopCode.of_module(names)
-        self._refuse_fork(code)
+        self.require_own(code)
         refuse_loop_elsewhere(code, self.difference(code))
         self.examine(code, self._renderers(names), names["GaussianModel"])
         self._attach_to_renderer(hooks, names)
@@ -186,7 +162,7 @@ class InriaFamily(AbstractAdapter):
                 f"Adapter {self.name!r} expects a function {LOOP}(), which {code.source} does not have; name the "
                 f"script that has it, or give SkipGate its module (docs/gate.md). It was checked with {self.checked}."
             )
-        self._refuse_fork(code)
+        self.require_own(code)
         refuse_loop_elsewhere(code, self.difference(code))
         # The script binds names of these modules when it imports them, so they are replaced right before.
         loaded: dict[str, dict[str, Any]] = {}
@@ -212,7 +188,7 @@ class InriaFamily(AbstractAdapter):
         if not present:
             raise AdapterMismatchError(
                 f"Adapter {self.name!r} found none of {', '.join(self.renders)} in {names.get('__name__')}; "
-                f"it was checked with {self.checked}."
+                f"it was checked with {self.checked}. Name another adapter, such as inria."
             )
         return present
 
@@ -255,7 +231,7 @@ class InriaFamily(AbstractAdapter):
                 self._cameras.restore()
             # Variables of the loop are read once, before they hold the graph of an iteration.
             if self._model() is not model:
-                self._refuse_fork(LoopCode.of_module(caller.f_globals))
+                self.require_own(LoopCode.of_module(caller.f_globals), begun=True)
                 self._model = weakref.ref(model)
                 self._read_run(hooks, names_around(caller))
                 hooks.check_drift(lambda: held_by(self._model()))
@@ -299,26 +275,19 @@ class InriaFamily(AbstractAdapter):
         """Return every key that `view_key` can return."""
         return [getattr(camera, self._label) for camera in cameras]
 
-    def _refuse_fork(self, code: LoopCode) -> None:
-        own, family = type(self), [one for one in registry.builtin_adapters() if issubclass(one, InriaFamily)]
-        asked = family if own in family else [own, *family]
-        right = next(one for one in asked if one.recognises(code.names))  # the last, `inria`, recognises every script
-        if right is not own:
-            raise AdapterMismatchError(
-                f"Adapter {self.name!r} is for {self.checked}, but {code.source} "
-                f"looks like the training script of {right.name!r}."
-            )
-
     def _read_run(self, hooks: Hooks, loop: Mapping[str, Any]) -> None:
         """Read options, views and first iteration from the loop's variables."""
         scene = next((loop[name] for name in self.scenes if name in loop), None)
         number = "iteration" if self._code is None else self._code.number
         missing = [name for name in (OPTIONS, number) if name not in loop]
         if scene is None or missing:
-            raise self.mismatch(f"{', '.join(missing or self.scenes)} among the variables of {LOOP}()")
+            wanted = ", ".join(missing or self.scenes)
+            raise self.mismatch(f"{wanted} among the variables of {LOOP}() (give the script's own these names)")
         opt, self._step, cameras = loop[OPTIONS], int(loop[number]), scene.getTrainCameras()
         if self.output_folder is None:  # a second run is not gated, and the report tells of the first
             self.output_folder = getattr(scene, "model_path", None)
+        if not all(hasattr(camera, self._label) for camera in cameras):
+            raise self.mismatch(f"cameras with an attribute {self._label}, by which it tells views apart")
         if len({camera.image_name for camera in cameras}) < len(cameras):
             caution(
                 "Several training images have the same name; the gate tells views apart by their position, "

@@ -30,6 +30,7 @@ class MiniSplatting(InriaFamily):
     left_alone = "Scores and depths for pruning are rendered without gradients and always run."
     stand_ins = "gaussianspa"
     mark = "num_depth"
+    needs = ("render_imp",)
     renders = ("render_imp",)
     structural = (*InriaFamily.structural, "reinitial_pts")
     changes = (*InriaFamily.changes, "densify_and_prune_split")

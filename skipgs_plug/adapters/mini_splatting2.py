@@ -27,6 +27,7 @@ class MiniSplatting2(InriaFamily):
     )
     left_alone = "Its sparse Adam has no gradients in skipped iterations. Needs CUDA: its culling has no stand-in."
     mark = "depth_reinit"
+    needs = ("render_imp", "simp_iteration2")
     renders = ("render_imp",)
     structural = (*InriaFamily.structural, "reinitial_pts", "init_culling")
     changes = (

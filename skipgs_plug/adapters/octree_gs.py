@@ -24,6 +24,7 @@ class OctreeGS(InriaFamily):
     )
     stand_ins = "scaffold_gs"
     mark = "set_coarse_interval"
+    needs = ("coarse_iter", "update_until")
     densification = Densification(marks=("update_interval",), needs="iterations")
     structural = ("prune_anchor", "training_setup")
     changes = ("adjust_anchor",)

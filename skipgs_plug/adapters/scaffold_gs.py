@@ -19,6 +19,7 @@ class ScaffoldGS(InriaFamily):
     left_alone = "Networks and anchors have one optimizer, which is left alone."
     stand_ins = "scaffold_gs"
     mark = "training_statis"  # `prefilter_voxel` is none: Spec-Gaussian culls plain Gaussians with it
+    needs = ("update_until",)
     changes = ("adjust_anchor",)
     calls = ("eval", "get_anchor", "train", "training_statis")
     arguments = ("retain_grad", "visible_mask")

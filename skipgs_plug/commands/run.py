@@ -18,6 +18,7 @@ from skipgs_plug.commands.options.gate import GateOptions
 from skipgs_plug.commands.options.run import Args
 from skipgs_plug.compat import FAMILIES, serve
 from skipgs_plug.compat.child_processes import also_in_children
+from skipgs_plug.core.caution import cautioned
 from skipgs_plug.core.errors import AdapterMismatchError, BrokenTrainingError
 from skipgs_plug.core.report import write_report
 from skipgs_plug.fallback_raster import ADAM_REPLACED, instead_of_torchs_adam
@@ -154,7 +155,8 @@ def run_gated(
 
     def finish() -> None:
         for gate in gates:
-            gate.detach()
+            with cautioned("Detaching the gate"):  # the script has done its work, so its exit code stands
+                gate.detach()
             if rank == 0 and not refused and begins.here:
                 report(gate, adapter)
 

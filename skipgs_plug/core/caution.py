@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from skipgs_plug.messages import say
 
@@ -24,3 +26,16 @@ def caution(sentence: str, stacklevel: int = 2) -> None:
         warnings.warn(sentence, GateWarning, stacklevel=stacklevel + 1)
     except GateWarning:
         say(sentence)
+
+
+@contextmanager
+def cautioned(what: str) -> Iterator[None]:
+    """A block after training, or at a release, whose error becomes a warning: the code after it must run.
+
+    Args:
+        what: What the block does; the sentence begins with it.
+    """
+    try:
+        yield
+    except Exception as error:
+        caution(f"{what} failed ({type(error).__name__}: {error}).", stacklevel=4)

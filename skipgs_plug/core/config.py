@@ -107,6 +107,8 @@ class SkipConfig:
         if self.always is not None:
             # Accept any collection of whole numbers and store a tuple. The class is frozen, hence object.__setattr__.
             object.__setattr__(self, "always", tuple(sorted(int(number) for number in self.always)))
+            if self.always and self.always[0] < 0:
+                raise SkipGSError(f"always must name iterations from 0 on, not {self.always[0]}.")
         if not (_is_number(self.tolerance) and self.tolerance >= 0.0):
             raise SkipGSError(f"tolerance must be a number of decibels >= 0, not {self.tolerance!r}.")
         if self.rate_peak is not None and not (_is_number(self.rate_peak) and self.rate_peak > 0.0):

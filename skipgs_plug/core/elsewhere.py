@@ -6,9 +6,9 @@ from collections.abc import Callable, Set
 
 from skipgs_plug.core.caution import caution
 
-# Backward passes of other functions after which the user is warned: few enough to stop in time. One or two can belong
-# to a preparation.
-WARNED_AFTER = 10
+# Backward passes of other functions that count as training, of which the user is warned: few enough to stop in time.
+# One or two can belong to a preparation.
+TRAINED_AFTER = 10
 
 
 class Elsewhere:
@@ -29,16 +29,19 @@ class Elsewhere:
         """What is awaited, as text."""
         return " or ".join(sorted(self._awaited))
 
+    @property
+    def trained(self) -> bool:
+        """Whether other functions may have trained, so that a refusal would lose what they did."""
+        return self._seen >= TRAINED_AFTER
+
     def note(self, caller: str) -> None:
         """Count a backward pass of a function, and warn once. It may train, or prepare something, so the run goes on.
 
         Args:
             caller: Name of the function.
         """
-        if not self._awaited or not self._matters():
-            return
         self._seen += 1
-        if self._seen == WARNED_AFTER:
+        if self._seen == TRAINED_AFTER and self._awaited and self._matters():
             who = "The script itself" if caller == "<module>" else f"{caller}()"
             caution(
                 f"{who} called backward, and no {self.expected} was seen, to which adapter {self._adapter!r} attaches. "

@@ -124,6 +124,10 @@ class Engine:
                 f"start_iter={self.start} is too early: up to iteration {read_until} this trainer's "
                 "densification reads the gradients; start there or later, or leave start_iter out."
             )
+        last = max(config.always or (0,))
+        if config.enabled and info.max_steps is not None and last > info.max_steps:
+            sentence = f"iteration {last}, and the run ends with {info.max_steps}; leave it out"
+            raise SkipGSError(f"always names {sentence}.", in_script=f"--always names {sentence}.")
         if info.view_names is not None:
             self._view_names = require_unique(info.view_names)
         if config.enabled and info.max_steps is not None and self.start > info.max_steps:
@@ -184,7 +188,7 @@ class Engine:
         self.clock.open(post)
 
     def gate(
-        self, view: str, signal: float | Tensor, run: Callable[[], Any], loss: Tensor, alone: bool = False
+        self, view: str, signal: float | Tensor, run: Callable[[], Any], loss: Tensor, frees_graph: bool = False
     ) -> bool:
         """Call `run`, a real backward pass, unless it is skipped; return True if gradients were computed and kept.
 
@@ -196,7 +200,7 @@ class Engine:
             signal: Value to decide by. A loss that a scaler has scaled stands for the loss before.
             run: The backward pass.
             loss: The tensor whose backward pass runs.
-            alone: Whether the iteration has no other backward pass, so that a skipped graph can be freed at once.
+            frees_graph: Whether nothing needs the graph after the backward pass, so that a skip can free it at once.
         """
         now = self.iteration
         if not now.gated:
@@ -216,7 +220,7 @@ class Engine:
                 self.rates.ran()
             else:
                 self._skipped.append(weakref.ref(loss))
-                if alone:
+                if frees_graph:
                     self.free_skipped()
         self.clock.mark()
         return not skip

@@ -15,7 +15,7 @@ from skipgs_plug.core.elsewhere import Elsewhere
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 from skipgs_plug.core.gaussian_count import GaussianCount
-from skipgs_plug.core.intercept import Around, Original, Patches, intercept_tensor_backward
+from skipgs_plug.core.intercept import Original, Patches, intercept_tensor_backward
 from skipgs_plug.core.loop_hooks import LoopHooks
 from skipgs_plug.core.loss_scaler import guard_scalers
 from skipgs_plug.core.optimizers import Optimizers
@@ -77,7 +77,7 @@ class Hooks(LoopHooks):
         self._adapter, self._given = adapter, given
         self._release, self._iteration = engine.release, engine.iteration
         self._release.undoes(self.restore)
-        self._release.refuses = lambda: max(self._iterations, self._backwards) <= 1  # nothing is lost yet
+        self._release.refuses = lambda: not self._has_trained
         self._release.in_script, self._release.attached = in_script, True
         self._guarded = self._release.guarded(lambda: self._iteration.step)
         self._ready = False
@@ -171,13 +171,14 @@ class Hooks(LoopHooks):
         if self._engine.policy is not None and step is not None:
             self._engine.notify_event(kind, step)
 
-    def backward(self, loss: torch.Tensor, run: Callable[[], Any], view: Any = None) -> Any:
+    def backward(self, loss: torch.Tensor, run: Callable[[], Any], view: Any = None, keeps_graph: bool = False) -> Any:
         """Gate a training backward pass: run it, unless it is skipped.
 
         Args:
             loss: The tensor whose backward pass runs.
             run: Runs the backward pass.
             view: Key of the view; None for the key that `view` reported.
+            keeps_graph: Whether the trainer may need the graph of the loss after this backward pass.
 
         Returns:
             The result of `run()` if the gate does not handle this backward pass, else None.
@@ -192,7 +193,7 @@ class Hooks(LoopHooks):
         try:
             if not self._is_training_backward():
                 return call()
-            self._gate(loss, view, call)
+            self._gate(loss, view, call, keeps_graph)
         except Exception as error:
             if call.failed:
                 raise  # the trainer's own
@@ -217,46 +218,17 @@ class Hooks(LoopHooks):
         self._odd_iterations -= 1
         return True
 
-    def _gate(self, loss: torch.Tensor, view: Any, call: Callable[[], Any]) -> None:
+    def _gate(self, loss: torch.Tensor, view: Any, call: Callable[[], Any], keeps_graph: bool) -> None:
         now = self._iteration
         view = now.view if view is None else view
         if view is None:
             raise self._mismatch("no training view was rendered before the backward")
         if callable(view):
             view = view() if self._engine.active else NOT_READ
-        self._engine.gate(view_key(view), loss if now.signal is None else now.signal, call, loss, alone=True)
+        signal = loss if now.signal is None else now.signal
+        self._engine.gate(view_key(view), signal, call, loss, frees_graph=not keeps_graph)
 
     # Ways to attach to the trainer.
-
-    def wrap(self, owner: Any, name: str, around: Around) -> None:
-        """Call `around(original, *args, **kwargs)` in place of each `owner.name(*args, **kwargs)`.
-
-        Args:
-            owner: A class (`args` then begin with the instance), an instance, a module, or the namespace dict of a
-                module.
-            name: Attribute to replace.
-            around: The replacement.
-
-        Raises:
-            AdapterMismatchError: The owner has no function of this name.
-            SkipGSError: A gate has replaced the name already.
-        """
-        self._patches.wrap(owner, name, around)
-
-    def before(self, owner: Any, name: str, call: Callable[..., Any]) -> None:
-        """Call `call(*args, **kwargs)` before each `owner.name(*args, **kwargs)`.
-
-        Args:
-            owner: The object that holds the function; see `wrap`, also for errors.
-            name: Attribute of the function.
-            call: The function to call first.
-        """
-
-        def around(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            call(*args, **kwargs)
-            return original(*args, **kwargs)
-
-        self.wrap(owner, name, around)
 
     def events(self, owner: Any, *names: str) -> None:
         """Report each call of these methods as a structural change with the method's name.
@@ -315,15 +287,6 @@ class Hooks(LoopHooks):
             "without it. Gate this loop by hand with SkipGate(start_iter=...)."
         )
 
-    def on_detach(self, label: str, undo: Callable[[], None]) -> None:
-        """Undo another change too when the gate is detached or released.
-
-        Args:
-            label: Name of what was changed, for `SkipGate.patched`.
-            undo: Undoes the change.
-        """
-        self._patches.add_undo(label, undo)
-
     @property
     def state(self) -> Engine:
         """Object with `state_dict` and `load_state_dict`, for trainers that save the state of other objects too."""
@@ -337,14 +300,14 @@ class Hooks(LoopHooks):
     # Questions of the gate.
 
     @property
-    def patched(self) -> list[str]:
-        """Every name that is replaced at present."""
-        return self._patches.names
-
-    @property
     def trained(self) -> bool:
         """Whether an iteration was seen, or a training backward pass outside of any iteration."""
         return self._iterations + self._backwards > 0
+
+    @property
+    def _has_trained(self) -> bool:
+        """Whether a refusal would lose trained iterations, or an earlier stage of the script."""
+        return max(self._iterations, self._backwards) > 1 or self._elsewhere.trained
 
     @property
     def released(self) -> bool:
@@ -372,10 +335,6 @@ class Hooks(LoopHooks):
 
     def _failed(self, error: Exception) -> None:
         self._release.on_error(error, self._iteration.step)
-
-    def restore(self) -> None:
-        """Restore every replaced name."""
-        self._patches.restore()
 
     def verify(self) -> None:
         """Raise AdapterMismatchError unless training ran, with one training backward per iteration, or without gate."""

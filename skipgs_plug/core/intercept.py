@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from skipgs_plug.core.caution import cautioned
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError
 
 Around = Callable[..., Any]  # called as around(original, *args, **kwargs) in place of original(*args, **kwargs)
@@ -119,10 +120,14 @@ class Patches:
         self._undo.append((label, undo))
 
     def restore(self) -> None:
-        """Undo all changes, the latest first. Further calls do nothing."""
+        """Undo all changes, the latest first. Further calls do nothing.
+
+        An undo may fail, because other code has changed the same thing. The user is warned, and the others follow.
+        """
         while self._undo:
-            _, undo = self._undo.pop()
-            undo()
+            label, undo = self._undo.pop()
+            with cautioned(f"Putting back {label}"):
+                undo()
 
     def _set(self, owner: Any, name: str, value: Any, label: str) -> None:
         if isinstance(owner, dict):
@@ -151,7 +156,7 @@ def _is_bound(function: Any, owner: Any) -> bool:
 def intercept_tensor_backward(
     patches: Patches,
     callers: Container[str],
-    gated: Callable[[torch.Tensor, Callable[[], Any]], Any],
+    gated: Callable[..., Any],
     other: Callable[[str], None] = lambda caller: None,
 ) -> None:
     """Pass scalar backward calls of functions with these names to `gated`.
@@ -163,7 +168,8 @@ def intercept_tensor_backward(
     Args:
         patches: List of replacements, to which this one is added.
         callers: Names of the functions that call the training backward.
-        gated: Receives the loss and a function that runs the real backward.
+        gated: Called as `gated(loss, run, keeps_graph=...)` with the loss, a function that runs the real backward, and
+            whether its graph is kept, because other code may need it.
         other: Receives the name of another function that calls backward on a scalar, before the call.
     """
 
@@ -179,13 +185,21 @@ def intercept_tensor_backward(
         if frame is None or not isinstance(loss, torch.Tensor) or loss.numel() != 1:
             return original(tensors, *args, **kwargs)
         if (caller := frame.f_code.co_name) in callers:
-            return gated(loss, lambda: original(tensors, *args, **kwargs))
+            return gated(loss, lambda: original(tensors, *args, **kwargs), keeps_graph=_keeps_graph(*args, **kwargs))
         if caller != "__torch_function__":  # of a mode such as that of --cpu, inside the call of a function
             other(caller)
         return original(tensors, *args, **kwargs)
 
     patches.wrap(torch.Tensor, "backward", around)
     patches.wrap(torch.autograd, "backward", around)
+
+
+def _keeps_graph(
+    gradient: Any = None, retain_graph: bool | None = None, create_graph: bool = False, *_: Any, **others: Any
+) -> bool:
+    """Whether backward, called with these arguments after the tensor, keeps a graph that other code may need later."""
+    kept = create_graph if retain_graph is None else retain_graph
+    return kept or others.get("inputs") is not None  # the graph between the loss and other inputs stays whole
 
 
 def _describe(owner: Any) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 from skipgs_plug.core.engine import Engine
 from skipgs_plug.core.intercept import Patches
+from skipgs_plug.core.name_hooks import NameHooks
 from skipgs_plug.core.optimizers import Named, Optimizers
 from skipgs_plug.core.pace.base import Always, Known, nothing_always, nothing_known
 from skipgs_plug.core.pace.loop_range import LoopRange, replace_range
@@ -15,7 +16,7 @@ from skipgs_plug.core.pace.schedulers import catch_up_schedulers
 from skipgs_plug.core.trainer_info import Densification
 
 
-class LoopHooks:
+class LoopHooks(NameHooks):
     """The part of `Hooks` about iterations that are left out, and about larger steps that make up for them.
 
     Args:
@@ -25,9 +26,9 @@ class LoopHooks:
     """
 
     def __init__(self, engine: Engine, optimizers: Optimizers, patches: Patches) -> None:
+        super().__init__(patches)
         self._engine = engine
         self._optimizers = optimizers
-        self._patches = patches
 
     def loop(
         self,

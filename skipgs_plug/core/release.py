@@ -10,7 +10,7 @@ from types import TracebackType
 import torch
 
 from skipgs_plug.core import decision, distributed
-from skipgs_plug.core.caution import caution
+from skipgs_plug.core.caution import caution, cautioned
 from skipgs_plug.core.decision import Decision
 from skipgs_plug.core.errors import BrokenTrainingError, DivergedError, GateOrderError, SkipGSError
 
@@ -141,7 +141,8 @@ class Release:
 
     def _take_back(self) -> None:
         for undo in self._undo:
-            undo()
+            with cautioned("Detaching the gate"):
+                undo()
 
 
 class _Guard:

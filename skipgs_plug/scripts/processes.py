@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from skipgs_plug.compat.stand_ins import stand_ins
-from skipgs_plug.core.elsewhere import WARNED_AFTER
+from skipgs_plug.core.elsewhere import TRAINED_AFTER
 from skipgs_plug.core.intercept import Patches, intercept_tensor_backward
 from skipgs_plug.messages import say
 
@@ -54,14 +54,14 @@ def told_if_it_trains(script: str) -> Iterator[None]:
     count = itertools.count(1)
 
     def note(caller: str) -> None:
-        if next(count) == WARNED_AFTER:
+        if next(count) == TRAINED_AFTER:
             say(
                 f"{caller}() called backward in a process that {script} has spawned, which no gate reaches. If this "
                 f"is training, nothing is gated. {IN_ONE_PROCESS}"
             )
 
     patches = Patches()
-    intercept_tensor_backward(patches, (), lambda loss, run: run(), note)
+    intercept_tensor_backward(patches, (), lambda loss, run, keeps_graph: run(), note)
     try:
         yield
     finally:

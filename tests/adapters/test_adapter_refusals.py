@@ -6,7 +6,7 @@ import types
 import pytest
 import torch
 from cases import RULE, SCRIPTS, run, script
-from lookalikes import fastgs, inria, speedy_splat
+from lookalikes import fastgs, inria, speedy_splat, taming
 from lookalikes.splats import NAMES, Scene, SplatModel, dataset, draw, make_cameras, new_log, photo_loss, pick
 
 from skipgs_plug import AdapterMismatchError, SkipGate, SkipGSError, UnknownTrainerError
@@ -29,19 +29,26 @@ def test_unknown_adapter_gets_the_list():
         SkipGate(inria, adapter="fastsg")
 
 
-@pytest.mark.parametrize("name", ["fastgs", "taming", "speedy_splat", "lightgaussian", "gaussianspa", "inria"])
+@pytest.mark.parametrize("name", ["fastgs", "taming", "speedy_splat", "lightgaussian", "gaussianspa"])
 def test_wrong_fork_is_named_with_the_right_one(name):
-    module = speedy_splat if name in ("inria", "taming") else inria
+    module = speedy_splat if name == "taming" else inria
     with pytest.raises(AdapterMismatchError) as error:
         SkipGate(module, adapter=name)
     assert f"Adapter {name!r}" in str(error.value)
     assert f"looks like the training script of {module.ADAPTER!r}" in str(error.value)
 
 
+def test_a_named_adapter_that_takes_unknown_forks_is_used_with_a_warning():
+    new_log()
+    with pytest.warns(GateWarning) as said, SkipGate(copied(speedy_splat), adapter="inria") as gate:
+        assert gate.adapter.name == "inria"
+    assert "looks like the training script of 'speedy_splat', whose adapter knows more" in str(said[0].message)
+
+
 def test_wrong_fork_of_a_script_is_noticed_in_its_first_iteration():
     new_log()
     module = copied(speedy_splat)
-    with SkipGate(copied(inria)) as gate:
+    with SkipGate(copied(taming)) as gate:
         adapter, hooks = gate.adapter, gate._hooks
         gate.detach()
         adapter._attach_to_model(hooks, vars(module))  # attach_script makes this call
@@ -236,3 +243,32 @@ def test_user_adapter_of_a_fork_is_asked_first(mine):
     finally:
         registry._registered.pop("mine", None)
     assert copy.copy(adapter_names())[0] == "reference"
+
+
+def test_cameras_without_a_name_are_refused_with_the_name():
+    module = train_module("loss.backward()")
+
+    class Nameless(Scene):
+        def getTrainCameras(self):
+            return [types.SimpleNamespace(original_image=one.original_image) for one in super().getTrainCameras()]
+
+    module.Scene = Nameless
+    with SkipGate(module), pytest.raises(AdapterMismatchError, match="expects cameras with an attribute image_name"):
+        module.training(dataset(), types.SimpleNamespace(iterations=5, densify_until_iter=2), None)
+
+
+def test_an_iteration_after_the_run_cannot_be_named():
+    module = train_module("loss.backward()")
+    with SkipGate(module, share=0.5, always=[4, 9]), pytest.raises(SkipGSError, match="names iteration 9, and the run"):
+        module.training(dataset(), types.SimpleNamespace(iterations=5, densify_until_iter=2), None)
+
+
+MARKS = ["num_depth", "depth_reinit", "OptimizingSpa", "compute_edge_score", "set_coarse_interval"]
+
+
+@pytest.mark.parametrize("name", MARKS)
+def test_a_mark_alone_makes_a_script_no_fork_of_that_name(name):
+    module = train_module("loss.backward()")
+    setattr(module, name, None)
+    with SkipGate(module) as gate:
+        assert gate.adapter.name == "inria"

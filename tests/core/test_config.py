@@ -30,6 +30,7 @@ from skipgs_plug.core.policy import SkipPolicy
         ("share", 0.0),
         ("grow_share", 1.5),
         ("max_gaussians", -1),
+        ("always", (5, -5)),
     ],
 )
 def test_bad_values_name_their_field(field: str, value) -> None:

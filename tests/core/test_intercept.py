@@ -79,6 +79,15 @@ def test_a_name_that_somebody_else_removed_keeps_nothing_from_being_put_back() -
     assert player.play() == 3
 
 
+def test_an_undo_that_fails_is_warned_of_and_the_others_follow() -> None:
+    original, patches = Base.work, Patches()
+    patches.wrap(Base, "work", twice)
+    patches.add_undo("the middle", [].pop)
+    with pytest.warns(RuntimeWarning, match=r"Putting back the middle failed \(IndexError"):
+        patches.restore()
+    assert patches.names == [] and Base.work is original
+
+
 def test_second_gate_is_refused() -> None:
     first, second = Patches(), Patches()
     first.wrap(Base, "work", twice)
@@ -105,7 +114,7 @@ def score(loss: torch.Tensor) -> None:
 def test_only_the_training_backward_is_handed_over() -> None:
     patches, seen = Patches(), []
     original = torch.Tensor.backward
-    intercept_tensor_backward(patches, ("training",), lambda loss, run: seen.append(loss.item()))
+    intercept_tensor_backward(patches, ("training",), lambda loss, run, keeps_graph: seen.append(loss.item()))
     try:
         a, b, c = (torch.ones(1, requires_grad=True) for _ in range(3))
         training(a.sum())
@@ -136,7 +145,8 @@ def test_backward_of_autograd_is_handed_over_too(in_list: bool) -> None:
     original = torch.autograd.backward
     a, b, c = (torch.ones(1, requires_grad=True) for _ in range(3))
 
-    def gated(loss: torch.Tensor, run: Callable[[], Any]) -> None:
+    def gated(loss: torch.Tensor, run: Callable[[], Any], keeps_graph: bool) -> None:
+        assert not keeps_graph
         seen.append(loss.item())
         run()
 
@@ -162,7 +172,7 @@ class Accelerator:
 
 def test_a_backward_that_calls_backward_is_not_its_caller() -> None:
     patches, seen = Patches(), []
-    intercept_tensor_backward(patches, ("training",), lambda loss, run: seen.append(loss.item()))
+    intercept_tensor_backward(patches, ("training",), lambda loss, run, keeps_graph: seen.append(loss.item()))
 
     def training(loss: torch.Tensor) -> None:
         Accelerator().backward(loss)
@@ -181,7 +191,7 @@ def test_a_backward_that_calls_backward_is_not_its_caller() -> None:
 
 def test_the_real_backward_keeps_its_arguments() -> None:
     patches = Patches()
-    intercept_tensor_backward(patches, ("training_twice",), lambda loss, run: run())
+    intercept_tensor_backward(patches, ("training_twice",), lambda loss, run, keeps_graph: run())
 
     def training_twice(loss: torch.Tensor) -> None:
         loss.backward(retain_graph=True)

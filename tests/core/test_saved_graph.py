@@ -16,6 +16,7 @@ from skipgs_plug.core.decision import AT_OR_BELOW_MEAN, FULL
 from skipgs_plug.core.policy import Policy
 from skipgs_plug.core.saved_graph import free_graph
 from tests.always import Always
+from tests.core.toy_trainer import ToyTrainer, attach
 
 N = 20_000
 
@@ -132,6 +133,39 @@ def test_a_backward_through_a_freed_graph_is_an_error_with_a_sentence():
             gate.update()
         with pytest.raises(SkipGSError, match="needs the graph of a loss whose backward pass was skipped"):
             loss.backward()
+
+
+class ReadsLater(ToyTrainer):
+    """Needs the graph of its loss once more after the training backward pass, every fiftieth iteration."""
+
+    def __init__(self, owner, arguments):
+        super().__init__()
+        self._owner, self._arguments, self.read = owner, arguments, []
+
+    def train(self):
+        for step in range(self.steps):
+            self.begin(step)
+            loss = (self.render(f"v{step % 10}") ** 2).mean()
+            args, kwargs = self._arguments if step % 50 == 0 else ((), {})
+            self._owner.backward(loss, *args, **kwargs)
+            if step % 50 == 0:
+                self.read += torch.autograd.grad(loss, self.parameter)
+            self.optimizer.step()
+            self.optimizer.zero_grad(set_to_none=True)
+
+
+KEPT = [((), {"retain_graph": True}), ((None, True), {}), ((None, None, True), {}), ((), {"create_graph": True})]
+
+
+@pytest.mark.parametrize("arguments", KEPT)
+@pytest.mark.parametrize("owner", [torch.Tensor, torch.autograd])
+@pytest.mark.filterwarnings("ignore:Using backward")  # of PyTorch, about memory of `create_graph`
+def test_a_graph_that_the_trainer_keeps_is_not_freed(owner, arguments):
+    trainer = ReadsLater(owner, arguments)
+    with attach(trainer, policy=Always()) as gate:
+        trainer.train()
+    assert gate.released is None and gate.stats()["backwards_skipped"] == 79
+    assert len(trainer.read) == 2 and trainer.read[1].abs().min() > 0
 
 
 def alive(forward):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from skipgs_plug.core.source.names import PLACES
@@ -42,9 +42,14 @@ class Assignments(NamedTuple):
         return self._replace(changed=self.changed - none, options=self.options - none)
 
 
-def assignments_in(body: Iterable[ast.stmt]) -> Assignments:
-    """Return the names and objects that these statements assign and change."""
-    parts = [node for one in body for node in ast.walk(one)]
+def assignments_in(body: Iterable[ast.stmt], is_off: Callable[[ast.expr], bool] = lambda test: False) -> Assignments:
+    """Return the names and objects that these statements assign and change.
+
+    Args:
+        body: The statements.
+        is_off: Whether a condition never holds, so that no iteration runs the statements under it.
+    """
+    parts = [node for one in body for node in _reached(one, is_off)]
     inner = set(map(id, comprehended(parts)))
     stored = [node for node in parts if isinstance(node, PLACES) and not isinstance(node.ctx, ast.Load)]
     assigned = [text_of(node) for node in stored if id(node) not in inner]
@@ -54,3 +59,14 @@ def assignments_in(body: Iterable[ast.stmt]) -> Assignments:
     options |= {ast.unparse(node.value) for node in stored if isinstance(node, ast.Subscript)}
     shrunk = {ast.unparse(method.value) for method in called if method.attr in SHRINKS}
     return Assignments(assigned, changed.union(assigned), options, shrunk)
+
+
+def _reached(node: ast.AST, is_off: Callable[[ast.expr], bool]) -> Iterator[ast.AST]:
+    """Iterate over a part of the source and all parts inside it, except the blocks of an `if` that never run."""
+    yield node
+    inside: Iterable[ast.AST] = ast.iter_child_nodes(node)
+    if isinstance(node, ast.If):
+        blocks = (node.test, node.body), (ast.UnaryOp(ast.Not(), node.test), node.orelse)
+        inside = [node.test, *(one for test, block in blocks if block and not is_off(test) for one in block)]
+    for child in inside:
+        yield from _reached(child, is_off)

@@ -9,16 +9,21 @@ from types import MethodType
 from typing import Any
 
 from skipgs_plug.core.source.assignments import assignments_in
-from skipgs_plug.core.source.conditions import position, unconditional
+from skipgs_plug.core.source.conditions import unconditional
 from skipgs_plug.core.source.evaluator import places_in
 from skipgs_plug.core.source.functions import called_function, syntax_of, undecorated, value_of
 from skipgs_plug.core.source.names import counted_by
 from skipgs_plug.core.source.project import Project
+from skipgs_plug.core.source.run_options import PURE
+
+# Functions and methods that end the gathering of gradients over a few iterations. Such a loop loses nothing if its
+# optimizers step after as many iterations that run.
+_ENDS_GATHERING = PURE | {"clip_grad_norm_", "parameters", "step", "unscale_", "update", "zero_grad"}
 
 
 def counters(
     body: Sequence[ast.stmt], names: Mapping[str, Any], assigned: Collection[str], project: Project
-) -> tuple[set[str], set[tuple[int, int]]]:
+) -> tuple[set[str], list[ast.If]]:
     """Return what a loop changes by a constant in every iteration: names, attributes and lengths.
 
     They are those of the loop, and those of objects that the loop calls in every iteration, as in `saver.count()`, or
@@ -31,13 +36,18 @@ def counters(
         project: The user's project. Methods of libraries are not read.
 
     Returns:
-        The counters, and the positions of conditions under which one is set back. A loop that gathers over a few
-        iterations has no other condition on its counter.
+        The counters, and the statements under whose conditions one is set back.
     """
     own = [text for text in _counted(body) if not _is_limited(text, names)]
     back = dict(_set_back(body))
-    conditions = {position(one.test) for ifs in back.values() for one in ifs}
-    return {*back, *own, *_counted_by_objects(body, names, assigned, project)}, conditions
+    ifs = [one for statements in back.values() for one in statements]
+    return {*back, *own, *_counted_by_objects(body, names, assigned, project)}, ifs
+
+
+def only_gathers(statement: ast.If) -> bool:
+    """Whether a statement under which a counter is set back does no more than end a gathering over a few iterations."""
+    calls = [part.func for one in statement.body for part in ast.walk(one) if isinstance(part, ast.Call)]
+    return all(getattr(called, "attr", getattr(called, "id", None)) in _ENDS_GATHERING for called in calls)
 
 
 def _set_back(body: Sequence[ast.stmt]) -> Iterator[tuple[str, list[ast.If]]]:

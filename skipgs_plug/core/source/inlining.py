@@ -23,7 +23,7 @@ from skipgs_plug.core.source.known_values import KnownValues
 from skipgs_plug.core.source.names import PLACES, bound_in, counted_by, holders_of, reached_in
 from skipgs_plug.core.source.reach import carries, reached_by, results
 from skipgs_plug.core.source.rewriting import Managed, OneName, Plain, Renamed, Repeated, Stored
-from skipgs_plug.core.source.run_options import assigned_globals, comprehended, text_of
+from skipgs_plug.core.source.run_options import PURE, assigned_globals, comprehended, text_of
 
 # Largest depth of nested calls that are read: a loop calls its trainer, which calls a logger, which opens a file.
 MAX_DEPTH = 5
@@ -182,8 +182,12 @@ class InlinedFunctions(KnownValues):
 
     def _is_read(self, call: ast.Call) -> bool:
         """Whether a call has a function that is known before the loop, and is not evaluated instead."""
-        name = call.func.id if isinstance(call.func, ast.Name) else None
-        return name not in self._pure and name not in self.unknown
+        match call.func:
+            case ast.Name(name):
+                return name not in self._pure and name not in self.unknown
+            case ast.Attribute(_, name):  # a method may have the name of a built-in function
+                return name not in self._pure or name in PURE
+        return True
 
     def _shares_number(self, plain: FunctionType | None, numbers: Collection[str]) -> bool:
         """Whether a function reads a variable of the loop that holds a number: a closure, or a global name."""

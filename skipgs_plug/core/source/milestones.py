@@ -17,7 +17,7 @@ from typing import Any
 
 from skipgs_plug.core.caution import caution
 from skipgs_plug.core.errors import SkipGSError
-from skipgs_plug.core.source.assignments import assignments_in
+from skipgs_plug.core.source.assignments import Assignments, assignments_in
 from skipgs_plug.core.source.bindings import assigned_values
 from skipgs_plug.core.source.conditions import (
     Condition,
@@ -28,7 +28,7 @@ from skipgs_plug.core.source.conditions import (
     position,
     unconditional,
 )
-from skipgs_plug.core.source.counters import counters, counts_in
+from skipgs_plug.core.source.counters import counters, counts_in, only_gathers
 from skipgs_plug.core.source.evaluator import DependsOnLoop, Evaluator, places_in
 from skipgs_plug.core.source.functions import value_of
 from skipgs_plug.core.source.inlining import InlinedFunction, InlinedFunctions
@@ -70,26 +70,35 @@ class TrainingLoop:
         self._target = target = statement.target.id
         Plain(code).visit_all(statement.body)
         Stored(lambda place: value_of(place, self._names, ())).visit_all(statement.body)
-        own, project = assignments_in(statement.body).possible(self._names), Project(code, self._names)
-        self._counters, self._set_back = counters(statement.body, self._names, own.assigned, project)
+        every, project = assignments_in(statement.body).possible(self._names), Project(code, self._names)
+        self._counters, back = counters(statement.body, self._names, every.assigned, project)
+        self._gathers = {position(one.test) for one in back if only_gathers(one)}
+        self._sets_back = {position(one.test) for one in back}
         functions = InlinedFunctions(
             statement.body,
             code,
             self._names,
             target,
             self._counters,
-            set(own.assigned).difference(known),
+            set(every.assigned).difference(known),
             pure | PURE,
         )
-        inlined = assignments_in(functions).possible(self._names)
-        by_loop = own.changed.difference(known)
-        changing = by_loop.union(functions.unknown, inlined.changed).difference(known)
-        no_options = changing.union({target}, own.options, inlined.options)
-        options = RunOptions(code, around, self._names, no_options, functions.shared, pure | PURE)
+        by_functions = functions.unknown.difference(every.assigned)
+
+        def evaluators(own: Assignments, inlined: Assignments) -> Iterator[Evaluator]:
+            """Yield the evaluator, and one for which functions change no value."""
+            changing = own.changed.union(by_functions, inlined.changed).difference(known)
+            no_options = changing.union({target}, own.options, inlined.options)
+            options = RunOptions(code, around, self._names, no_options, functions.shared, pure | PURE)
+            yield Evaluator(target, functions.counted, self._names, changing, options)
+            yield Evaluator(target, (), self._names, own.changed.difference(known), options)
+
+        # What stands behind an option that is off changes nothing.
+        is_off = next(evaluators(every, assignments_in(functions).possible(self._names))).is_off
+        own, inlined = (assignments_in(one, is_off).possible(self._names) for one in (statement.body, functions))
+        self._evaluator, self._evaluator_of_loop = evaluators(own, inlined)
         counted = decisions_by_count(self._body, self._names, project)
         self._decisions_by_count = [Condition(test, (), InlinedFunction([], one, {})) for test, one in counted]
-        self._evaluator = Evaluator(target, functions.counted, self._names, changing, options)
-        self._evaluator_of_loop = Evaluator(target, (), self._names, by_loop, options)
         self._inner = set(inner_values(statement.body))
         self._bar_ifs = outermost_bar_ifs(statement.body, names, around)
         times = Counter([*own.assigned, *inlined.assigned])
@@ -206,11 +215,12 @@ class TrainingLoop:
         hits = _rarer(self._evaluator_of_loop, condition, numbers)
         if hits is None and not others_named:
             text, line = ast.unparse(condition.test), line_in_file(condition.test, self._code)
-            raise SkipGSError(
+            sentence = (
                 f"Line {line} of {self._code.co_filename} has a condition on the iteration's number that cannot be "
                 f"evaluated ahead ({text}), so an iteration that it needs could be left out; use the gate without a "
-                f"share, or {BY_ALWAYS}."
+                "share, or name the iterations that must run"
             )
+            raise SkipGSError(f"{sentence} (always=).", in_script=f"{sentence} (--always).")
         return hits
 
     def _only_numbers(self, condition: Condition, numbers: range) -> set[int] | None:
@@ -232,11 +242,12 @@ class TrainingLoop:
         """Yield all conditions on a counter of the loop's own, or of a function, which misses left-out iterations."""
         lines: set[str] = set()
         for condition in self._all:
-            sets_back = condition.function is None and position(condition.test) in self._set_back
-            if sets_back or any(self._evaluator.is_off(guard) for guard in condition.guards):
+            place = position(condition.test) if condition.function is None else None
+            if place in self._gathers or any(self._evaluator.is_off(guard) for guard in condition.guards):
                 continue
             for leaf in leaves(condition.test):
-                picks = isinstance(leaf, (ast.Compare, ast.BinOp)) and is_point(leaf)
+                # A limit at which a counter begins anew picks single numbers, too.
+                picks = isinstance(leaf, (ast.Compare, ast.BinOp)) and (is_point(leaf) or place in self._sets_back)
                 if picks and counts_in(leaf) & self._counters and not self._evaluator.mentions(leaf):
                     lines.add(self._where(condition))
                     yield condition._replace(test=leaf)

@@ -9,6 +9,7 @@ from typing import Any
 
 from skipgs_plug.core.source.assignments import assignments_in
 from skipgs_plug.core.source.conditions import conditions_in, leaves
+from skipgs_plug.core.source.counters import only_gathers
 from skipgs_plug.core.source.evaluator import places_in
 from skipgs_plug.core.source.functions import called_function, closure, syntax_of, undecorated, value_of
 from skipgs_plug.core.source.inlining import MAX_DEPTH
@@ -23,8 +24,8 @@ def decisions_by_count(
 ) -> Iterator[tuple[ast.expr, CodeType]]:
     """Yield conditions on counters of functions that a loop calls, each with the code of its function.
 
-    A counter keeps its value between calls, gets a constant more in its function, and is not set back there. The
-    functions need not receive the iteration's number.
+    A counter keeps its value between calls, and gets a constant more in its function. If it is set back there, it
+    decides by the condition under which it is. The functions need not receive the iteration's number.
 
     Args:
         body: The loop's statements.
@@ -70,17 +71,23 @@ def _called(body: Iterable[ast.stmt], names: Mapping[str, Any]) -> Iterator[tupl
 
 
 def _decisions(function: ast.FunctionDef) -> Iterator[ast.expr]:
-    """Yield the conditions of a function on remainders, or on single values, of its counters."""
-    counts = _counts(function)
+    """Yield the conditions of a function on remainders or single values of its counters, or that set one back."""
+    counted = _counted(function)
+    assigned = assignments_in(function.body).assigned
+    counts = {text for text in counted if assigned.count(text) == counted.count(text)}
     if counts:
         for condition in conditions_in(function.body, {}):
             for leaf in leaves(condition.test):
                 if any(places_in(one) & counts for one in (*remainders(leaf), *compared(leaf))):
                     yield leaf
+    for node in ast.walk(function):
+        if isinstance(node, ast.If) and not only_gathers(node):
+            back = {*counted}.difference(counts).intersection(assignments_in(node.body).assigned)
+            yield from (leaf for leaf in leaves(node.test) if places_in(leaf) & back)
 
 
-def _counts(function: ast.FunctionDef) -> set[str]:
-    """Return the places of a function that keep their values between calls, and to which it adds constants only."""
+def _counted(function: ast.FunctionDef) -> list[str]:
+    """Return the places of a function that keep their values between calls, once for each constant that it adds."""
     nodes = [*ast.walk(function)]
     shared = {name for node in nodes if isinstance(node, (ast.Global, ast.Nonlocal)) for name in node.names}
     added = [
@@ -88,9 +95,7 @@ def _counts(function: ast.FunctionDef) -> set[str]:
         for node in nodes
         if isinstance(node, ast.AugAssign) and isinstance(node.op, (ast.Add, ast.Sub)) and _is_number(node.value)
     ]
-    assigned = assignments_in(function.body).assigned
-    texts = [text_of(one) for one in added if not isinstance(one, ast.Name) or one.id in shared]
-    return {text for text in texts if assigned.count(text) == texts.count(text)}
+    return [text_of(one) for one in added if not isinstance(one, ast.Name) or one.id in shared]
 
 
 def _is_number(value: ast.expr) -> bool:

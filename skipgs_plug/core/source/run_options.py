@@ -6,7 +6,9 @@ import ast
 import functools
 import inspect
 import linecache
+import os
 import re
+import sys
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from types import CodeType, FunctionType
@@ -29,7 +31,8 @@ class RunOptions:
     """Recognises the options of a run: names that a function has before its loop and that the loop does not assign.
 
     Only plain values count (numbers, text, flags, None and collections of them), in variables of the function itself,
-    in constants of its module, in dictionaries, or in objects without methods, such as a namespace of options. Methods
+    in constants of its module, in dictionaries, or in objects without methods, such as a namespace of options. So do
+    the arguments and the environment of the process, and whether there is CUDA. Methods
     of other objects, such as a model, may change them; but a part of such an object that is None, and that no method
     assigns, stays None.
 
@@ -131,10 +134,26 @@ class RunOptions:
                 return getattr(self._object(holder), "__dict__", {}).get(name)
         return None
 
+    def _of_process(self, node: ast.expr) -> Any:
+        """Return the arguments or the environment of the process, or what a call tells of them; else `_UNKNOWN`."""
+        match node:
+            case ast.Call(function, [], []) if self._object(function) is torch.cuda.is_available:
+                return torch.cuda.is_available()
+            case ast.Call(function, [ast.Constant(str(key)), *default], []) if self._object(function) is os.getenv:
+                values = [one.value for one in default if isinstance(one, ast.Constant)]
+                return os.environ.get(key, *values) if len(values) == len(default) else _UNKNOWN
+            case ast.Name() | ast.Attribute():
+                found = self._object(node)
+                if found is os.environ or found is sys.argv:
+                    return dict(found) if found is os.environ else tuple(found)
+        return _UNKNOWN
+
     def _look_up(self, node: ast.expr) -> Any:
         """Return the value of an option, or of an object that holds options; `_UNKNOWN` if it is neither."""
         if text_of(node) in self._changing:
             return _UNKNOWN
+        if (setting := self._of_process(node)) is not _UNKNOWN:
+            return setting
         match node:
             case ast.Name(name):
                 return _UNKNOWN if name in self._shared else self._names.get(name, _UNKNOWN)

@@ -11,10 +11,12 @@ ADAPTER, FIRST, START, LAST = "dash_gaussian", 1, 20, 60
 
 class TrainingScheduler:
     def __init__(self, opt):
-        self.until = opt.densify_until_iter
+        self.begins, self.level = (0, opt.densify_until_iter // 2, opt.densify_until_iter, float("inf")), 0
 
     def get_res_scale(self, iteration):
-        return 2 if iteration < self.until // 2 else 1
+        while iteration >= self.begins[self.level + 1]:
+            self.level += 1
+        return (2, 1, 1)[self.level]
 
 
 class GaussianModel(SplatModel):

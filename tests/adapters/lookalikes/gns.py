@@ -84,7 +84,7 @@ def training(dataset, opt, pipe, checkpoint, args):
                 gaussians.update_opacity_lr(1 / 4)
             if iteration in opt.saving_iterations:
                 scene.save(iteration)
-            if iteration < opt.iterations:
+            if iteration < opt.iterations and opt.optimizer_type == "default":
                 if iteration <= 24:
                     step(gaussians)
                 elif iteration <= 40:

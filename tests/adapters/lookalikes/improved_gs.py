@@ -71,7 +71,7 @@ def training(dataset, opt, pipe, checkpoint, args):
                     gaussians.reset_opacity()
             if iteration in opt.saving_iterations:
                 scene.save(iteration)
-            if iteration < opt.iterations:
+            if iteration < opt.iterations and opt.optimizer_type == "default":
                 if iteration <= 20:
                     step(gaussians)
                 elif iteration <= 40:

@@ -43,6 +43,13 @@ def tick(count=calls):
         print("save")
 
 
+def tick_anew(count=calls):
+    count[0] += 1
+    if count[0] >= 40:
+        print("save")
+        count[0] = 0
+
+
 def length_of_a_queue(stop):
     losses = deque()
     for _step in stop(losses=losses):
@@ -68,6 +75,11 @@ def count_of_a_function(stop):
         tick()
 
 
+def count_that_a_function_sets_back(stop):
+    for _step in stop():
+        tick_anew()
+
+
 def count_below_a_function(stop):
     def work():
         tick()
@@ -86,7 +98,7 @@ def count_that_is_assigned(stop):
 
 COUNTED = [
     *(length_of_a_queue, length_in_an_object, count_of_a_module, count_of_a_function, count_below_a_function),
-    count_that_is_assigned,
+    *(count_that_is_assigned, count_that_a_function_sets_back),
 ]
 
 

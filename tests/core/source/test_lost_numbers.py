@@ -118,7 +118,7 @@ def local_names_in_a_condition(stop):
 def assigned_twice(stop):
     for step in stop():
         n = step
-        if "late" in "some":
+        if id(stop) == 0:
             n = 5
         if n % 40 == 0:
             print("save")

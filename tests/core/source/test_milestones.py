@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from read_milestones import found
 
 from skipgs_plug import SkipGSError
@@ -365,7 +366,27 @@ def test_a_count_that_the_loop_sets_back_is_warned_of_where_it_decides_about_som
 
     with pytest.warns(RuntimeWarning, match="counts the iterations that run") as said:
         assert found(loop) == {"step == 70": [70]}
-    assert [str(one.message).partition("(")[2].partition(")")[0] for one in said] == ["since % 10 == 0", "other == 20"]
+    assert [str(one.message).partition("(")[2].partition(")")[0] for one in said] == [
+        "since % 10 == 0",
+        "since == last",
+        "other == 20",
+    ]
+
+    def saving(stop):
+        since, left = 0, 30
+        for _step in stop():
+            since += 1
+            if since >= 50:
+                print("save")
+                since = 0
+            left -= 1
+            if left == 0:
+                print("save")
+                left = 30
+
+    with pytest.warns(RuntimeWarning, match="counts the iterations that run") as said:
+        assert found(saving) == {}
+    assert [str(one.message).partition("(")[2].partition(")")[0] for one in said] == ["since >= 50", "left == 0"]
 
 
 def test_a_number_that_is_kept_in_an_entry_of_a_table_is_the_number():
@@ -408,10 +429,12 @@ def test_a_limit_that_a_condition_moves_is_warned_of():
 
 def test_gathering_over_a_few_iterations_is_nothing_to_warn_of():
     def loop(stop):
-        gathered, images = 0, 0
-        for step in stop():
+        gathered, images, optimizer = 0, 0, torch.optim.Adam([torch.zeros(1)])
+        for step in stop(optimizer=optimizer):
             gathered += 1
             if gathered == 4:  # counts the iterations that run
+                optimizer.step()
+                optimizer.zero_grad(set_to_none=True)
                 gathered = 0
             if step % 2 == 0:
                 images += 1
