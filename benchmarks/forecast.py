@@ -39,11 +39,11 @@ SETTINGS = {
     "lego": ("lego_200", 1, 0.001),
     "bonsai": ("bonsai", 4, 0.001),
 }
+# Processor seconds of training from which a forecast is made. The half minute of the command would be nearly all of a
+# run on such small scenes, and so no forecast: of a large scene it is a small part, as these seconds are here.
+SECONDS = {"fern": 5.0, "fern_defaults": 20.0, "lego": 2.5, "bonsai": 5.0}
 LENGTHS = (3000, 6000, 7000, 30_000)  # iterations of the bench's runs, and of the runs made here
 RUN = 7000  # iterations of a run made here
-# Processor seconds of training from which a forecast is made. The half minute of the command would be nearly all of a
-# run on such small scenes, and so no forecast. On a large scene it is a small part of a run, as these seconds are here.
-SECONDS = 5.0
 
 
 def settings(name: str, steps: int) -> tuple[TrainConfig, Scene]:
@@ -79,7 +79,7 @@ def measure(name: str, steps: int, how: str) -> dict[str, Any]:
 def pilot(name: str) -> dict[str, Any]:
     """Return the forecasts from the first seconds of training."""
     config, scene = settings(name, RUN)
-    trial = run_pilot(config, scene, SECONDS, by_processor=True)
+    trial = run_pilot(config, scene, SECONDS[name], by_processor=True)
     return {
         "iterations": len(trial.samples),
         "gaussians": trial.samples[-1].gaussians,
