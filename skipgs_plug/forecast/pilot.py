@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -55,6 +56,12 @@ class Pilot:
     half_size: bool
     peak_memory: int | None
     fading: bool
+
+    @property
+    def grew(self) -> bool:
+        """Whether growth can be forecast: an event added Gaussians, or densification ended without one that did."""
+        numbers = [self.first_gaussians, *(sample.gaussians for sample in self.samples)]
+        return self.samples[-1].step >= self.stop or any(b > a for a, b in itertools.pairwise(numbers))
 
 
 def run_pilot(
