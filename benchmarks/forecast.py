@@ -2,7 +2,6 @@
 
     python benchmarks/forecast.py fern             # a few seconds of training, then a whole run with share="auto"
     python benchmarks/forecast.py lego own         # and a run that leaves nothing out
-    python benchmarks/forecast.py lego pilot       # only the forecast anew, after a change of skipgs_plug/forecast
     python benchmarks/forecast.py compare          # errors of all forecasts whose runs are stored
 
 Numbers of Gaussians are also compared with the runs that `skipgs-plug bench --whole` stored in
@@ -148,12 +147,9 @@ def main(arguments: list[str]) -> None:
     stored = json.loads(FILE.read_text()) if FILE.exists() else {}
     name, *more = arguments
     if name in SETTINGS:
-        # The runs stay where only the forecast is made anew.
-        found = stored.setdefault(name, {})
-        found["pilot"] = {"provenance": provenance(), **pilot(name)}
-        if more != ["pilot"]:
-            found["runs"] = [measure(name, RUN, how) for how in ("auto", *more)]
-            found["provenance"] = provenance()
+        found = {"provenance": provenance(), "pilot": pilot(name)}
+        found["runs"] = [measure(name, RUN, how) for how in ("auto", *more)]
+        stored[name] = found
         write_json(FILE, stored)
     rows = compare(stored, bench_runs())
     write_json(ERRORS, {"provenance": "benchmarks/forecast.py", "rows": rows})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,7 @@ from skipgs_plug import SkipGate
 from skipgs_plug.cli import main
 from skipgs_plug.commands.estimate import errors_seen
 from skipgs_plug.forecast.errors import QUANTITIES, error, measured_errors, spread
-from skipgs_plug.forecast.pilot import Pilot, Sample, run_pilot
+from skipgs_plug.forecast.pilot import PILOT_STEPS, Pilot, Sample, run_pilot
 from skipgs_plug.forecast.predict import fit_cost, fit_growth, growth_shape, predict
 from skipgs_plug.trainer import TrainConfig, Trainer, save_packed
 from skipgs_plug.trainer.synthetic import make_scene
@@ -160,6 +161,24 @@ def test_errors_were_measured_and_are_printed() -> None:
     assert low == min(error(row) for row in rows if row["quantity"] == "seconds_auto") and low <= high
     assert f"with --share auto {100 * low:+.0f} to {100 * high:+.0f} % (runs: {count})" in errors_seen()
     assert spread(rows, "nothing") is None
+
+
+@pytest.mark.parametrize("grown", [False, True])
+def test_an_error_counts_only_if_the_pilot_did_not_see_the_end(grown: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks")
+    compare = importlib.import_module("forecast").compare
+    run = {"how": "auto", "seconds": 20.0, "iterations": 2000, "gaussians": 30_000, "memory": None}
+    long = {"scene": "fern", "how": "own", "seconds": None, "iterations": 30_000, "gaussians": 40_000, "memory": None}
+    forecast = {"seconds": 1.0, "seconds_auto": 10.0, "iterations_auto": 1000, "gaussians": 20_000, "memory": 1}
+    forecasts = [{**forecast, "max_steps": steps} for steps in (PILOT_STEPS, 30_000)]
+    pilot = {"iterations": 500, "grown": grown, "forecasts": forecasts}
+    stored = {"fern": {"pilot": pilot, "runs": [{**run, "max_steps": PILOT_STEPS}]}}
+    rows = compare(stored, [{**long, "max_steps": 30_000}])
+    found = {(row["max_steps"], row["quantity"]): error(row) for row in rows}
+    of_the_pilots_schedule = {(7000, quantity): -0.5 for quantity in ("seconds_auto", "iterations_auto")}
+    of_the_pilots_schedule[7000, "gaussians"] = pytest.approx(-1 / 3)
+    assert found == {**({} if grown else of_the_pilots_schedule), (30_000, "gaussians"): -0.5}
+    assert {row["part"] for row in rows} == {round(500 / 30_000, 3)} | (set() if grown else {0.25})
 
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
