@@ -18,7 +18,7 @@ from skipgs_plug.core.pace.needs import (
     share_after_event,
 )
 from skipgs_plug.core.trainer_info import Densification
-from skipgs_plug.forecast.pilot import Pilot
+from skipgs_plug.forecast.pilot import GROUP, Pilot
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.strategy import reset_interval
 
@@ -28,7 +28,6 @@ USUAL_POWER = 0.5
 # Weight of the usual power. The pilot's own power counts as much if the weighted squared deviations of the logarithm
 # of its numbers of Gaussians add up to this value.
 POWER_WEIGHT = 1.0
-GROUP = 20  # iterations whose mean time counts as one measurement: single times vary too much
 # The number of Gaussians approaches its final value as 1 - exp(-rate * x). x is the finished part of densification.
 USUAL_RATE = 2.2
 # Weight of log(rate / USUAL_RATE)**2 against the sum of squared errors, which are relative to the largest growth.

@@ -14,7 +14,7 @@ from skipgs_plug import SkipGate
 from skipgs_plug.cli import main
 from skipgs_plug.commands.estimate import errors_seen
 from skipgs_plug.forecast.errors import QUANTITIES, error, measured_errors, spread
-from skipgs_plug.forecast.pilot import PILOT_STEPS, Pilot, Sample, run_pilot
+from skipgs_plug.forecast.pilot import GROUP, PILOT_STEPS, Pilot, Sample, run_pilot
 from skipgs_plug.forecast.predict import fit_cost, fit_growth, growth_shape, predict
 from skipgs_plug.trainer import TrainConfig, Trainer, save_packed
 from skipgs_plug.trainer.synthetic import make_scene
@@ -71,6 +71,7 @@ def test_without_an_event_the_command_gives_lower_bounds(
     save_packed(make_scene(n_views=10, width=32, height=24, n_points=160), path)
     assert main(["estimate", str(path), "--seconds", "0.0001", "--no-progress", "--backend", "warp"]) == 0
     shown = capsys.readouterr().out
+    assert f"{GROUP + 1} iterations in" in shown
     assert shown.count("at least 160 ") == 2 and "at least" in shown.splitlines()[3].split("160")[0]
     assert "No densification that adds Gaussians was seen" in shown and "a lower bound" in shown
     assert "give a larger --seconds than 0.0001." in shown and "Errors of such estimates" not in shown
