@@ -182,10 +182,16 @@ def explain(error: Exception, extra: str) -> str | None:
         if denied is None or isinstance(error, OSError):
             return str(error)
         error = denied
-    if isinstance(error, ModuleNotFoundError) and not (error.name or "").startswith("skipgs_plug"):
-        from skipgs_plug.install import install_command
+    if isinstance(error, ImportError):
+        while isinstance(error.__cause__, ImportError):  # the import itself: the error after it is for users of Python
+            error = error.__cause__
+        package = failed_package(error)
+        if not package.startswith("skipgs_plug"):
+            from skipgs_plug.install import install_command
 
-        return f"This command needs the package {error.name}; run: {install_command(extra)}"
+            reason = str(error).partition("\n")[0]
+            why = "" if isinstance(error, ModuleNotFoundError) else f", which cannot be imported ({reason})"
+            return f"This command needs the package {package}{why}; run: {install_command(extra)}"
     if isinstance(error, OSError) and error.errno and error.strerror:
         from skipgs_plug.files import OUT_OF_SPACE
 
@@ -199,6 +205,16 @@ def explain(error: Exception, extra: str) -> str | None:
         cause = str(error).partition("\n")[0]
         return f"There is not enough memory ({cause}); give smaller numbers, or a larger --data-factor."
     return None
+
+
+def failed_package(error: ImportError) -> str:
+    """Return the module that could not be imported, or the one whose code raised the error if the error names none."""
+    if error.name:
+        return error.name
+    raised = error.__traceback__
+    while raised is not None and raised.tb_next is not None:
+        raised = raised.tb_next
+    return str(raised.tb_frame.f_globals["__name__"]) if raised is not None else ""
 
 
 def is_out_of_memory(error: Exception) -> bool:

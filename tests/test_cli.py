@@ -17,9 +17,10 @@ import torch
 from PIL import Image
 from plyfile import PlyData
 
-from skipgs_plug.cli import COMMANDS, WARNINGS, main
+from skipgs_plug.cli import COMMANDS, WARNINGS, explain, main
 from skipgs_plug.commands.demo import LEAST
 from skipgs_plug.core.caution import GateWarning
+from skipgs_plug.install import install_command
 from skipgs_plug.messages import plain_warnings
 from skipgs_plug.trainer import Trainer, save_packed
 from skipgs_plug.trainer.synthetic import make_scene
@@ -75,6 +76,47 @@ def test_bad_input_is_one_sentence(tmp_path: Path, packed: str, capsys: pytest.C
     capsys.readouterr()
     assert main(["train", packed, "--out", out, "--resume", "--debug"]) == 2
     assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["train", "estimate"])
+def test_a_missing_warp_is_said_before_the_scene_is_read(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "warp", None)
+    out = ["--out", str(tmp_path / "run")] if command == "train" else []
+    assert main([command, str(tmp_path / "nowhere"), *out, "--backend", "warp"]) == 2
+    assert f"Backend warp needs NVIDIA Warp, which is not installed; run: {install_command()}" in one_sentence(capsys)
+
+
+def test_a_missing_plyfile_is_said_before_training(
+    tmp_path: Path, packed: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "plyfile", None)
+    assert main(["train", packed, "--out", str(tmp_path / "run"), *SHORT]) == 2
+    assert f"needs the package plyfile; run: {install_command('train')}" in one_sentence(capsys)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_broken_package_is_named_with_its_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "plyfile.py").write_text("raise ImportError('libbroken.so: cannot open')")
+    monkeypatch.delitem(sys.modules, "plyfile", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert main(["train", str(tmp_path), "--out", str(tmp_path / "run"), *SHORT]) == 2
+    said = one_sentence(capsys)
+    assert "the package plyfile, which cannot be imported (libbroken.so: cannot open); run: pip install" in said
+
+
+def test_the_import_that_failed_is_named_and_a_defect_of_this_package_keeps_its_traceback() -> None:
+    def failed(cause: ImportError) -> ImportError:  # as the rasterizer raises it for users of Python
+        error = ImportError("The CPU rasterizer needs NVIDIA Warp.")
+        error.__cause__ = cause
+        return error
+
+    said = explain(failed(ModuleNotFoundError("No module named 'warp'", name="warp")), "view")
+    assert said == f"This command needs the package warp; run: {install_command('view')}"
+    assert explain(failed(ImportError("cannot import name", name="skipgs_plug.cli")), "view") is None
 
 
 def test_run_folder(tmp_path: Path, packed: str, capsys: pytest.CaptureFixture[str]) -> None:

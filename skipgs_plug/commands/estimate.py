@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 from skipgs_plug.commands.options.estimate import Args
@@ -22,8 +23,11 @@ def run(args: Args) -> int:
     scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts, config.init_ply)
     pilot = run_pilot(config, scene, args.seconds, progress=not args.no_progress)
     print(described(scene.name, pilot))
-    print(table([predict(pilot, config, steps) for steps in args.steps]))
-    print(errors_seen())
+    if not pilot.grew:
+        # The first of so few iterations waits for kernels, so with it time would not be a lower bound.
+        pilot = dataclasses.replace(pilot, samples=pilot.samples[1:])
+    print(table([predict(pilot, config, steps) for steps in args.steps], "" if pilot.grew else "at least "))
+    print(errors_seen() if pilot.grew else nothing_seen(args.seconds))
     return 0
 
 
@@ -36,15 +40,15 @@ def described(name: str, pilot: Pilot) -> str:
     )
 
 
-def table(forecasts: Sequence[Forecast]) -> str:
-    """Return one row per length of run."""
+def table(forecasts: Sequence[Forecast], bound: str = "") -> str:
+    """Return one row per length of run, with `bound` before each value."""
     rows = [
         (
             f"{one.max_steps:,}",
-            duration(one.seconds),
-            duration(one.seconds_auto),
-            rounded(one.gaussians),
-            "unknown" if one.memory is None else f"{one.memory / 2**30:.1f} GiB",
+            bound + duration(one.seconds),
+            bound + duration(one.seconds_auto),
+            bound + rounded(one.gaussians),
+            "unknown" if one.memory is None else f"{bound}{one.memory / 2**30:.1f} GiB",
         )
         for one in forecasts
     ]
@@ -53,19 +57,32 @@ def table(forecasts: Sequence[Forecast]) -> str:
     return "\n".join(lines)
 
 
+def nothing_seen(seconds: float) -> str:
+    """Return the sentence for a pilot of some seconds in which no Gaussian was added."""
+    return (
+        "\nNo densification that adds Gaussians was seen. So their number is the present one: a lower bound, unless "
+        "more are pruned than added. Time and memory depend on it, so they are lower bounds too; give a larger "
+        f"--seconds than {seconds:g}."
+    )
+
+
 def errors_seen() -> str:
     """Return a sentence about the errors of earlier estimates, measured on runs of the bench."""
-    stored = measured_errors()
-    scenes = sorted({row["scene"] for row in stored["rows"]})
+    rows = measured_errors()["rows"]
+    scenes = sorted({row["scene"] for row in rows})
+    seen = [100 * row["part"] for row in rows]
     parts = []
     for head, quantity in zip(HEADS[1:], SHOWN, strict=True):
-        found = spread(stored["rows"], quantity)
+        found = spread(rows, quantity)
         if found is None:
             parts.append(f"{head} not compared yet")
         else:
             low, high, count = found
             parts.append(f"{head} {100 * low:+.0f} to {100 * high:+.0f} % (runs: {count})")
-    return f"\nErrors of such estimates on {', '.join(scenes)}: {'; '.join(parts)}. Loading and saving come on top."
+    return (
+        f"\nErrors of such estimates on {', '.join(scenes)}, made from {min(seen):.0f} to {max(seen):.0f} % of a "
+        f"run: {'; '.join(parts)}. Loading and saving come on top."
+    )
 
 
 def duration(seconds: float) -> str:

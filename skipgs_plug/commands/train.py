@@ -118,6 +118,8 @@ def check(args: Args, checkpoints: list[Path]) -> None:
             f"{args.scene} holds photographs but no cameras; add --sfm to reconstruct them "
             f"first, or run: {next_command('sfm', args.scene, 'SCENE')}."
         )
+    import plyfile  # noqa: F401 - otherwise only the written model would show that it is missing, after training
+
     if args.session.lpips_net is not None:
         require_lpips(args.session.lpips_net)
     if checkpoints and not args.resume:

@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import Any
 
 FILE = Path(__file__).with_name("errors.json")
-QUANTITIES = ("seconds", "seconds_auto", "gaussians", "memory")
+QUANTITIES = ("seconds", "seconds_auto", "iterations_auto", "gaussians", "memory")
 
 
 def measured_errors() -> dict[str, Any]:
-    """Return `provenance`, and `rows` with the keys `scene`, `max_steps`, `quantity`, `expected` and `measured`."""
+    """Return `provenance`, and `rows`: `scene`, `max_steps`, `how`, `part`, `quantity`, `expected` and `measured`.
+
+    `part` is the share of the run's iterations that were trained for the forecast.
+    """
     return json.loads(FILE.read_text("utf-8"))  # type: ignore[no-any-return]
 
 

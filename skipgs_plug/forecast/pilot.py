@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ from skipgs_plug.core.half_size import in_unit_range, kept_at_half_size, some_of
 from skipgs_plug.trainer import Scene, TrainConfig, Trainer
 from skipgs_plug.trainer.loop import Iteration
 
+GROUP = 20  # iterations whose mean time counts as one measurement: single times vary too much
 PILOT_STEPS = 7000  # iterations in the schedule of the pilot, which runs only the first of them
 
 
@@ -56,11 +58,19 @@ class Pilot:
     peak_memory: int | None
     fading: bool
 
+    @property
+    def grew(self) -> bool:
+        """Whether growth can be forecast: an event added Gaussians, or densification ended without one that did."""
+        numbers = [self.first_gaussians, *(sample.gaussians for sample in self.samples)]
+        return self.samples[-1].step >= self.stop or any(b > a for a, b in itertools.pairwise(numbers))
+
 
 def run_pilot(
     config: TrainConfig, scene: Scene, seconds: float, by_processor: bool = False, progress: bool = False
 ) -> Pilot:
     """Train for some seconds, or until a schedule of `PILOT_STEPS` ends, and discard the model.
+
+    At least `GROUP` iterations run after the first one, which waits for kernels.
 
     The pilot leaves out iterations (`share="auto"`), so it reaches many densification events in a short time. The
     number of Gaussians at each event follows that of runs that leave out nothing.
@@ -82,7 +92,7 @@ def run_pilot(
         nonlocal before
         samples.append(Sample(iteration.step, trainer.num_gaussians, clock.total - before))
         before = clock.total
-        trainer.stop_requested = before >= seconds
+        trainer.stop_requested = before >= seconds and len(samples) > GROUP
 
     first = trainer.num_gaussians
     trainer.on_step = after

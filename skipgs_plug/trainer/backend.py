@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -170,20 +171,14 @@ def single_precision() -> Iterator[None]:
         torch.set_default_dtype(before)
 
 
-def choose_backend(name: str = "auto") -> str:
-    """Return the name of the backend that `resolve_backend` returns."""
-    if name != "auto":
-        return name
-    return "gsplat" if torch.cuda.is_available() and _has_gsplat() else "warp"
-
-
 def resolve_backend(name: str = "auto") -> Backend:
     """Return the backend called "gsplat" or "warp"; "auto" is gsplat if CUDA works, else warp.
 
     Raises:
         InputError: The backend cannot run here; the message names the missing part.
     """
-    name = choose_backend(name)
+    if name == "auto":
+        name = "gsplat" if torch.cuda.is_available() and _has_gsplat() else "warp"
     if name == "gsplat":
         return _gsplat_backend()
     if name == "warp":
@@ -212,8 +207,9 @@ def _gsplat_backend() -> Backend:
 
 
 def _warp_backend() -> Backend:
-    try:
-        from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
-    except ImportError as error:
-        raise InputError(f"Backend warp cannot be imported ({error}); run: {install_command()}.") from error
+    from skipgs_plug.fallback_raster import l1_ssim_loss, rasterization
+
+    # Warp itself is imported with the first kernel, on a spare thread, because it takes long.
+    if importlib.util.find_spec("warp") is None:
+        raise InputError(f"Backend warp needs NVIDIA Warp, which is not installed; run: {install_command()}.")
     return CpuBackend("warp", torch.device("cpu"), rasterization, l1_ssim_loss)

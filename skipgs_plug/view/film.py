@@ -23,6 +23,7 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int) -> None:
         WriteError: The film cannot be written completely.
     """
     import imageio.v2 as iio
+    from imageio_ffmpeg import count_frames_and_secs  # imageio says too little if this package of its own is missing
 
     with write_aside(path) as temporary:
         target = temporary.with_suffix(".mp4")  # ffmpeg goes by the suffix
@@ -32,7 +33,9 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int) -> None:
             with iio.get_writer(target, format="FFMPEG", **options) as writer:
                 given = append_frames(writer, path, frames)
             with encoder_ended_early(path):
-                check_length(target, given)
+                found = count_frames_and_secs(str(target))[0]
+                if found != given:  # imageio ignores the exit code of its encoder
+                    raise RuntimeError(f"{target} has {found} of {given} frames")
             target.replace(temporary)
         finally:
             target.unlink(missing_ok=True)
@@ -58,15 +61,6 @@ def encoder_ended_early(path: Path) -> Iterator[None]:
         raise WriteError(
             f"{path} cannot be written (the encoder ended early; see its output); make room or give another path."
         ) from error
-
-
-def check_length(film: Path, frames: int) -> None:
-    """Raise RuntimeError unless a film has this number of frames: imageio ignores the exit code of its encoder."""
-    from imageio_ffmpeg import count_frames_and_secs
-
-    found = count_frames_and_secs(str(film))[0]
-    if found != frames:
-        raise RuntimeError(f"{film} has {found} of {frames} frames")
 
 
 def write_pictures(folder: Path, frames: Iterable[np.ndarray], names: Iterable[str]) -> None:

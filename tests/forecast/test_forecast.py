@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,7 @@ from skipgs_plug import SkipGate
 from skipgs_plug.cli import main
 from skipgs_plug.commands.estimate import errors_seen
 from skipgs_plug.forecast.errors import QUANTITIES, error, measured_errors, spread
-from skipgs_plug.forecast.pilot import Pilot, Sample, run_pilot
+from skipgs_plug.forecast.pilot import GROUP, PILOT_STEPS, Pilot, Sample, run_pilot
 from skipgs_plug.forecast.predict import fit_cost, fit_growth, growth_shape, predict
 from skipgs_plug.trainer import TrainConfig, Trainer, save_packed
 from skipgs_plug.trainer.synthetic import make_scene
@@ -47,8 +48,33 @@ def test_growth_that_has_ended_is_met() -> None:
 
 
 def test_without_an_event_nothing_is_said_to_grow() -> None:
-    growth = fit_growth(pilot_of(0.02), TrainConfig())
-    assert growth(1.0) == FIRST
+    early = pilot_of(0.02)
+    assert fit_growth(early, TrainConfig())(1.0) == FIRST and not early.grew
+    assert pilot_of(0.2).grew
+    ended = dataclasses.replace(early, samples=(*early.samples, Sample(STOP, FIRST, 0.01)))
+    assert ended.grew  # no event adds a Gaussian to such a scene
+
+
+def test_growth_is_counted_from_the_lowest_number() -> None:
+    seen = pilot_of(0.5)
+    random = dataclasses.replace(seen, first_gaussians=4 * FIRST)  # most of its points are pruned at once
+    growth = fit_growth(random, TrainConfig())
+    assert growth(0.0) == 4 * FIRST and growth(1.0) == pytest.approx(FIRST + ADDED, rel=0.08)
+    still = dataclasses.replace(pilot_of(0.02), first_gaussians=4 * FIRST)
+    assert not still.grew and fit_growth(still, TrainConfig())(1.0) == FIRST
+
+
+def test_without_an_event_the_command_gives_lower_bounds(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "tiny.npz"
+    save_packed(make_scene(n_views=10, width=32, height=24, n_points=160), path)
+    assert main(["estimate", str(path), "--seconds", "0.0001", "--no-progress", "--backend", "warp"]) == 0
+    shown = capsys.readouterr().out
+    assert f"{GROUP + 1} iterations in" in shown
+    assert shown.count("at least 160 ") == 2 and "at least" in shown.splitlines()[3].split("160")[0]
+    assert "No densification that adds Gaussians was seen" in shown and "a lower bound" in shown
+    assert "give a larger --seconds than 0.0001." in shown and "Errors of such estimates" not in shown
 
 
 def test_mcmc_grows_no_further_than_its_cap() -> None:
@@ -129,7 +155,7 @@ def test_errors_were_measured_and_are_printed() -> None:
     rows = measured_errors()["rows"]
     assert rows
     for row in rows:
-        assert row["quantity"] in QUANTITIES and row["expected"] > 0 and row["measured"] > 0
+        assert row["quantity"] in QUANTITIES and row["expected"] > 0 and row["measured"] > 0 and 0 < row["part"] < 0.5
     found = spread(rows, "seconds_auto")
     assert found is not None
     low, high, count = found
@@ -138,10 +164,29 @@ def test_errors_were_measured_and_are_printed() -> None:
     assert spread(rows, "nothing") is None
 
 
+@pytest.mark.parametrize("grown", [False, True])
+def test_an_error_counts_only_if_the_pilot_did_not_see_the_end(grown: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks")
+    compare = importlib.import_module("forecast").compare
+    run = {"how": "auto", "seconds": 20.0, "iterations": 2000, "gaussians": 30_000, "memory": None}
+    long = {"scene": "fern", "how": "own", "seconds": None, "iterations": 30_000, "gaussians": 40_000, "memory": None}
+    forecast = {"seconds": 1.0, "seconds_auto": 10.0, "iterations_auto": 1000, "gaussians": 20_000, "memory": 1}
+    forecasts = [{**forecast, "max_steps": steps} for steps in (PILOT_STEPS, 30_000)]
+    pilot = {"iterations": 500, "grown": grown, "forecasts": forecasts}
+    stored = {"fern": {"pilot": pilot, "runs": [{**run, "max_steps": PILOT_STEPS}]}}
+    rows = compare(stored, [{**long, "max_steps": 30_000}])
+    found = {(row["max_steps"], row["quantity"]): error(row) for row in rows}
+    of_the_pilots_schedule = {(7000, quantity): -0.5 for quantity in ("seconds_auto", "iterations_auto")}
+    of_the_pilots_schedule[7000, "gaussians"] = pytest.approx(-1 / 3)
+    assert found == {**({} if grown else of_the_pilots_schedule), (30_000, "gaussians"): -0.5}
+    assert {row["part"] for row in rows} == {round(500 / 30_000, 3)} | (set() if grown else {0.25})
+
+
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "tiny.npz"
     save_packed(make_scene(n_views=10, width=32, height=24, n_points=160), path)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Pilot, "grew", True)  # whether so short a pilot gets that far depends on the machine
     command = ["estimate", str(path), "--seconds", "0.3", "--steps", "700", "7000", "--no-progress"]
     assert main(command) == 0
     shown = capsys.readouterr().out.splitlines()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -32,6 +34,19 @@ def test_a_film_along_the_path(run_folder, tmp_path, capsys):
     assert iio.immeta(film, plugin="FFMPEG")["fps"] == 5
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
     assert np.abs(frames[0].astype(float) - frames[-1]).mean() > 2  # the camera moves
+
+
+@pytest.mark.parametrize(
+    ("module", "sentence"),
+    [("imageio_ffmpeg", "needs the package imageio_ffmpeg; run: "), ("warp", "Backend warp needs NVIDIA Warp")],
+)
+def test_a_missing_package_is_one_sentence(module, sentence, run_folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, module, None)
+    command = ["render", str(run_folder), str(tmp_path / "film.mp4"), "--backend", "warp", "--no-progress"]
+    assert main(command) == 2
+    error = capsys.readouterr().err
+    assert sentence in error and "pip install" in error and error.count("\n") == 1
+    assert not any(tmp_path.iterdir())
 
 
 def test_held_out_pictures_are_what_the_trainer_renders(run_folder, scene_file, tmp_path):
