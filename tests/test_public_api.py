@@ -71,7 +71,10 @@ ADAPTER = {
 }
 HOOKS = {
     "always": "(self, always: 'Always') -> 'None'",
-    "backward": "(self, loss: 'torch.Tensor', run: 'Callable[[], Any]', view: 'Any' = None) -> 'Any'",
+    "backward": (
+        "(self, loss: 'torch.Tensor', run: 'Callable[[], Any]', view: 'Any' = None, keeps_graph: 'bool' = False) "
+        "-> 'Any'"
+    ),
     "before": "(self, owner: 'Any', name: 'str', call: 'Callable[..., Any]') -> 'None'",
     "check_drift": "(self, optimizers: 'Optimizers') -> 'None'",
     "event": "(self, kind: 'str') -> 'None'",

@@ -282,12 +282,12 @@ class InriaFamily(MarkedScript):
         missing = [name for name in (OPTIONS, number) if name not in loop]
         if scene is None or missing:
             wanted = ", ".join(missing or self.scenes)
-            raise self.mismatch(f"{wanted} among the variables of {LOOP}() (give the script's own these names)")
+            raise self.mismatch(f"{wanted} among the variables of {LOOP}(); rename the script's own to that")
         opt, self._step, cameras = loop[OPTIONS], int(loop[number]), scene.getTrainCameras()
         if self.output_folder is None:  # a second run is not gated, and the report tells of the first
             self.output_folder = getattr(scene, "model_path", None)
         if not all(hasattr(camera, self._label) for camera in cameras):
-            raise self.mismatch(f"cameras with an attribute {self._label}, by which it tells views apart")
+            raise self.mismatch(f"cameras with an attribute {self._label}, by which it tells views apart; add one")
         if len({camera.image_name for camera in cameras}) < len(cameras):
             caution(
                 "Several training images have the same name; the gate tells views apart by their position, "

@@ -182,12 +182,16 @@ class InlinedFunctions(KnownValues):
 
     def _is_read(self, call: ast.Call) -> bool:
         """Whether a call has a function that is known before the loop, and is not evaluated instead."""
-        match call.func:
+        return not self._is_pure(call.func) and not (isinstance(call.func, ast.Name) and call.func.id in self.unknown)
+
+    def _is_pure(self, function: ast.expr) -> bool:
+        """Whether a function is evaluated and not read, or a method is said to need no iteration."""
+        match function:
             case ast.Name(name):
-                return name not in self._pure and name not in self.unknown
-            case ast.Attribute(_, name):  # a method may have the name of a built-in function
-                return name not in self._pure or name in PURE
-        return True
+                return name in self._pure
+            case ast.Attribute(_, name):  # it may have the name of a built-in function
+                return name in self._pure and name not in PURE
+        return False
 
     def _shares_number(self, plain: FunctionType | None, numbers: Collection[str]) -> bool:
         """Whether a function reads a variable of the loop that holds a number: a closure, or a global name."""
@@ -219,10 +223,12 @@ class InlinedFunctions(KnownValues):
         """Whether this calls a function with the number that is not known before the loop, and may decide by it."""
         if not (isinstance(node, ast.Call) and self._receives(node, numbers, holders) and self._gets(node)):
             return False
+        if self._is_pure(node.func):
+            return False
         match node.func:
             case ast.Name(name):
                 is_new = name in self.unknown or not hasattr(builtins, name)
-                return is_new and not {name} & {*self._pure, *self._names, *self._looped, *self._made}
+                return is_new and not {name} & {*self._names, *self._looped, *self._made}
             case ast.Call(made) if inspect.isclass(self._function(made)):
                 return False
         return chooses_decision(node.func, self._value, self._project, self._open)
