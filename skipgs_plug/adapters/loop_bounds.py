@@ -97,11 +97,11 @@ class CallReader:
         self.trainer = TrainerCode()
         self._stops, self._gated, self._windows = frozenset(stops), frozenset(gated), frozenset(windows)
         self._open: list[CodeType] = []  # code of the functions that are being read, outermost first
-        # Whether reads of gradients need no training backward here: a function around them compares a gradient with
-        # None, or has run a backward of its own.
+        # Whether reads of gradients need no training backward here: a condition around or before them compares a
+        # gradient with None, or a function around them has run a backward of its own.
         self._gradient_safe = False
         self._only_gradients = False  # inside a function of `stops`
-        self._checked: set[ast.expr] = set()  # gradients that functions give a name, which they compare with None
+        self._checked: set[ast.expr] = set()  # gradients that functions compare with None
 
     def read(self, function: Any, numbers: Collection[str], values: Mapping[str, Any], end: int | None = None) -> None:
         """Read a function or a bound method.
@@ -118,7 +118,6 @@ class CallReader:
         if plain is None or syntax is None or plain.__code__ in self._open or len(self._open) == MAX_DEPTH:
             return
         outer = self._gradient_safe
-        self._gradient_safe = outer or expects_none(syntax)
         self._checked.update(checked_gradients(syntax))
         self._open.append(plain.__code__)
         self._body(syntax.body, self._scope(function, plain, syntax, numbers, values), end)
@@ -138,7 +137,7 @@ class CallReader:
 
     def read_loops(self, function: ast.FunctionDef, scope: Scope) -> None:
         """Read the loops of a function, or all of it if it has none."""
-        scope, self._gradient_safe = scope_inside(function, scope), expects_none(function)
+        scope = scope_inside(function, scope)
         self._checked.update(checked_gradients(function))
         for body in [loop.body for loop in outermost_loops(function)] or [function.body]:
             self._body(body, scope, None)
@@ -155,10 +154,13 @@ class CallReader:
                 decides = inside != 0 or statement.orelse
                 self._ask(statement.test, self.asked if decides else self.passed_over)
                 after = _sooner(end, self._end(statement.test, scope, holds=False))
+                outer, self._gradient_safe = self._gradient_safe, self._gradient_safe or expects_none(statement.test)
                 self._body(statement.body, scope, inside)
                 self._body(statement.orelse, scope, after)
                 if isinstance(statement, ast.If) and isinstance(statement.body[-1], (ast.Return, ast.Continue)):
                     end = after
+                elif expects_none(statement.test):
+                    self._gradient_safe = outer
                 continue
             if isinstance(statement, ast.Match):
                 self._ask(statement.subject, self.asked)

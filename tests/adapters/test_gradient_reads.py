@@ -2,7 +2,7 @@
 
 import pytest
 from cases import SCRIPTS, SkipAlways
-from lookalikes import edgs, faster_gs, fvdb, fvdb_frgs, gsplat_runner, litegs, threedgrut
+from lookalikes import edgs, faster_gs, fvdb, fvdb_frgs, gsplat_runner, litegs, nerfstudio, threedgrut
 from lookalikes.splats import log, new_log
 from test_unknown_changes import forked
 from test_unknown_forks import TRAIN, GaussianModel, from_file, train  # noqa: F401
@@ -21,6 +21,7 @@ OBJECTS = {
     "fvdb": (fvdb, BATCHES, lambda fork: fork.SceneOptimizationRunner()),
     "fvdb_frgs": (fvdb_frgs, BATCHES, lambda fork: fork.GaussianSplatReconstruction()),
     "litegs": (litegs, LOSS, lambda fork: fork),
+    "nerfstudio": (nerfstudio, "self.grad_scaler.scale(loss).backward()\n", lambda fork: fork.Trainer().setup()),
     "gsplat": (gsplat_runner, f'{LOSS}            f"loss', lambda fork: fork.Runner(fork.DefaultStrategy())),
 }
 
@@ -122,3 +123,29 @@ def test_a_function_reads_the_gradients_of_its_own_backward():
         model.update(step)
 
     assert ends(loop) == {"update": None, READS_GRADIENT: 12}
+
+
+def test_a_question_for_one_gradient_answers_for_no_other():
+    def asks(values, others):
+        if values.grad is not None:
+            log.norm = others.grad.norm()
+        return values.grad
+
+    def guarded(values, others):
+        for value in values:
+            if value.grad is None:
+                continue
+            log.norm = others.grad.norm()
+
+    def beside(values, others):
+        if values.grad is not None:
+            log.norm = values.grad.norm()
+        log.last = others.grad.norm()
+
+    found = {}
+    for function in (asks, guarded, beside):
+        reader = CallReader()
+        reader.trainer.add(function)
+        reader.read(function, {"step"}, {})
+        found[function] = READS_GRADIENT in reader.ends
+    assert found == {asks: False, guarded: False, beside: True}
