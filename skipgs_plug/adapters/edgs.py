@@ -66,7 +66,7 @@ class EDGS(AbstractAdapter):
             return original(*args, **kwargs)
 
         gaussians = type(trainer.GS.gaussians)
-        survey = Survey(self, [gaussians], CALLS, CHANGES)
+        survey = Survey(self, [gaussians], CALLS, CHANGES, [STEP])
         survey.read(trainer.train, "self.gs_step", "self.training_step")
         hooks.wrap(trainer, STEP, stepped)
         hooks.wrap(trainer.GS, "forward", rendered)
@@ -75,4 +75,5 @@ class EDGS(AbstractAdapter):
         self.output_folder = getattr(trainer.scene, "model_path", None)
         end = int(trainer.training_config.densify_until_iter)
         views = [view_key(camera.image_name) for camera in trainer.scene.getTrainCameras()]
-        hooks.ready(TrainerInfo(survey.start_after_changes(end), view_names=views, gradients_read_until=end))
+        read_until = max(end, survey.end_of_gradients(end))
+        hooks.ready(TrainerInfo(survey.start_after_changes(end), view_names=views, gradients_read_until=read_until))

@@ -87,7 +87,7 @@ class FasterGS(AbstractAdapter):
             return original(gaussians, inject_noise=inject_noise and not hooks.state.skipped)
 
         gaussians = type(trainer.model.gaussians)
-        survey = Survey(self, [gaussians], KNOWN, set(EVENTS) - set(KNOWN))
+        survey = Survey(self, [gaussians], KNOWN, set(EVENTS) - set(KNOWN), [LOOP])
         for callback, ends in callbacks(trainer):
             survey.read(callback, "iteration", values={"self": trainer}, end=ends)
         hooks.wrap(trainer.renderer, "render_image_training", rendered)
@@ -96,8 +96,9 @@ class FasterGS(AbstractAdapter):
         hooks.gate_tensor_backward(LOOP)
         self.output_folder = str(trainer.output_directory) if hasattr(trainer, "output_directory") else None
         end, last = int(trainer.DENSIFICATION_END_ITERATION), int(trainer.NUM_ITERATIONS) - 1
+        read_until = max(end, survey.end_of_gradients(end + 1, last))
         start = survey.start_after_changes(end + 1, last)
-        hooks.ready(TrainerInfo(start, max_steps=last, gradients_read_until=end))
+        hooks.ready(TrainerInfo(start, max_steps=last, gradients_read_until=read_until))
 
 
 def callbacks(trainer: Any) -> Iterator[tuple[Callable[..., Any], int | None]]:

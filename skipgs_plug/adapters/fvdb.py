@@ -122,10 +122,12 @@ class FVDB(AbstractAdapter):
         end = int(config.refine_stop_epoch * steps)
         if config.optimize_camera_poses:
             end = max(end, int(config.pose_opt_stop_epoch * steps))
-        survey = Survey(self, [type(optimizer)], KNOWN, EVENTS)
+        survey = Survey(self, [type(optimizer)], KNOWN, EVENTS, [kind.loop])
         survey.read(getattr(runner, kind.loop), "self._global_step")
-        start = survey.start_after_changes(end, math.inf if config.max_steps is None else config.max_steps)
-        hooks.ready(TrainerInfo(start, max_steps=config.max_steps, gradients_read_until=end))
+        last = math.inf if config.max_steps is None else config.max_steps
+        read_until = max(end, survey.end_of_gradients(end, last))
+        start = survey.start_after_changes(end, last)
+        hooks.ready(TrainerInfo(start, max_steps=config.max_steps, gradients_read_until=read_until))
 
 
 def _runner_of(trainer: Any) -> Runner | None:

@@ -102,7 +102,7 @@ class GsplatRunner(AbstractAdapter):
             raise self.mismatch(f"a Runner with {', '.join(missing)}")
         strategy = runner.cfg.strategy
         refuse_frozen(runner.cfg, hooks)
-        survey = survey_of(self, strategy)
+        survey = survey_of(self, LOOP, strategy)
         survey.read(runner.train, "step")
         batched = runner.cfg.batch_size > 1
         names = [BATCH] if batched else view_names(runner)

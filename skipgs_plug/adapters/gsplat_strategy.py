@@ -33,10 +33,13 @@ STAGES = ("step_pre_backward", "step_post_backward", "_update_state")
 Resets = Callable[[int], bool]
 
 
-def survey_of(adapter: Adapter, strategy: Any, *owners: Any, through: Iterable[str] = ()) -> Survey:
-    """Return a survey of calls by which a strategy, or more owners of the model, change it; see `Survey`."""
+def survey_of(adapter: Adapter, loop: str, strategy: Any, *owners: Any, through: Iterable[str] = ()) -> Survey:
+    """Return a survey of calls by which a strategy, or more owners of the model, change it; see `Survey`.
+
+    `loop` is the name of the method that calls the training backward.
+    """
     operations = [sys.modules[OPERATIONS]] if OPERATIONS in sys.modules else []
-    return Survey(adapter, [type(strategy), *operations, *owners], KNOWN, CHANGES, [*STAGES, *through])
+    return Survey(adapter, [type(strategy), *operations, *owners], KNOWN, CHANGES, [loop], [*STAGES, *through])
 
 
 def is_mcmc(strategy: Any) -> bool:
@@ -44,7 +47,7 @@ def is_mcmc(strategy: Any) -> bool:
     return hasattr(strategy, "noise_lr")
 
 
-def first_iterations(survey: Survey, strategy: Any, last: int) -> tuple[int | None, int | None]:
+def first_iterations(survey: Survey, strategy: Any, last: int) -> tuple[int | None, int]:
     """Return the first iteration that the gate may skip, and the first one whose gradients nothing reads.
 
     Strategies of others, and models that densify by themselves (nerfstudio before 1.1.5), may have no
@@ -56,16 +59,16 @@ def first_iterations(survey: Survey, strategy: Any, last: int) -> tuple[int | No
         last: Last iteration of the run.
 
     Returns:
-        Both, None if not known. The second is None, too, if gradients are never read.
+        Both. The first is None if it is not known, and the second is 0 if gradients are never read.
 
     Raises:
         AdapterMismatchError: Gradients are read until the end of the run, or the end of densification moves.
     """
     stop = getattr(strategy, "refine_stop_iter", None)
-    read_until = survey.end_of_gradients(last if stop is None else max(last, stop))
+    read_until = survey.end_of_gradients(0 if stop is None else int(stop), last)
     if stop is not None and not is_mcmc(strategy):
-        read_until = max(int(stop), read_until or 0)
-    start = read_until if stop is None else int(stop)
+        read_until = max(int(stop), read_until)
+    start = read_until or None if stop is None else int(stop)
     return (None if start is None else survey.start_after_changes(start, last)), read_until
 
 

@@ -21,7 +21,7 @@ import torch
 from skipgs_plug.adapters.base import gate_backwards_only
 from skipgs_plug.adapters.half_size_cameras import HalfSizeCameras
 from skipgs_plug.adapters.import_hook import when_imported
-from skipgs_plug.adapters.loop_bounds import READS_GRADIENT, SETS_END, read_loops
+from skipgs_plug.adapters.loop_bounds import READS_GRADIENT, read_loops
 from skipgs_plug.adapters.loop_code import LOOP, OPTIONS, LoopCode, asks_for_random_points, names_around, namespace_of
 from skipgs_plug.adapters.marks import MarkedScript
 from skipgs_plug.adapters.unknown_forks import (
@@ -58,7 +58,6 @@ class InriaFamily(MarkedScript):
         scenes: Possible names of the loop's variable for its Scene.
         changes: Further methods that change the model. The gate begins after the last call of these and `structural`.
         pausing: Methods in `changes` that the trainer also calls after the gate has begun. Each call pauses the gate.
-        uses: Uses of attributes that put the gate's start off or refuse it; see `loop_bounds`.
         calls: Further names of methods and noise that the adapter knows beyond those of Inria's loop.
         arguments: Arguments of the renderer that the adapter knows, beyond those of Inria's.
         densification: How to recognise its densification events; None if all iterations of densification must run.
@@ -72,7 +71,6 @@ class InriaFamily(MarkedScript):
     scenes: ClassVar[tuple[str, ...]] = ("scene",)
     changes: ClassVar[tuple[str, ...]] = ("densify_and_prune",)
     pausing: ClassVar[tuple[str, ...]] = ()
-    uses: ClassVar[tuple[str, ...]] = ()
     calls: ClassVar[tuple[str, ...]] = ()
     arguments: ClassVar[tuple[str, ...]] = ()
     pure: ClassVar[tuple[str, ...]] = ()
@@ -296,15 +294,16 @@ class InriaFamily(MarkedScript):
             self._label = "uid"
         self.begin(opt, loop)
         ends = self._ends_of_calls(loop)
+        start, read_until = self.start_iter(opt, loop), self.gradients_read_until(opt, loop)
         known = None if self._unknown.listed or not self.shows_half_size else self._code
         self._cameras = HalfSizeCameras.of(hooks, cameras, known, self.renders)
         hooks.ready(
             TrainerInfo(
-                begin_after(self.start_iter(opt, loop), opt.iterations, ends),
+                begin_after(start, opt.iterations, ends),
                 settled_iter=self.settled_iter(opt, loop),
                 view_names=[view_key(key) for key in self.view_keys(cameras)],
                 max_steps=opt.iterations,
-                gradients_read_until=self.gradients_read_until(opt, loop),
+                gradients_read_until=max(read_until, ends.get(READS_GRADIENT, 0)),
                 accumulates=self.accumulates(opt, loop),
                 steps_each=self.steps_each(opt, loop),
                 slow_positions=True,  # they reach their last rate in `position_lr_max_steps`, by default 30,000
@@ -319,11 +318,13 @@ class InriaFamily(MarkedScript):
         if self._code is None or self._code.syntax is None:
             return {}
         parts = (self._model_class, undecorated(loop.get(LOOP)))
-        awaited = self._unknown.calls.union(self.structural, self.changes, self.uses)
-        found = read_loops(self._code.syntax, self._code.number, loop, parts, awaited | self._known_calls())
+        awaited = self._unknown.calls.union(self.structural, self.changes, [READS_GRADIENT])
+        stops = awaited | self._known_calls()
+        found = read_loops(self._code.syntax, self._code.number, loop, parts, stops, self._code.callers)
         adds = changing(self._unknown.calls).union(self.changes) & found.ends.keys()
         self._densifies = UNTIL in found.asked or UNTIL not in found.passed_over or bool(adds)
-        refuse_loop_without_end(found.ends if self.uses else {}, loop[OPTIONS].iterations, self.difference(self._code))
+        opt, who = loop[OPTIONS], self.difference(self._code)
+        refuse_loop_without_end(found.ends, self.start_iter(opt, loop), opt.iterations, who)
         return {name: end for name, end in found.ends.items() if end is not None and name in awaited - {*self.pausing}}
 
     def _known_calls(self) -> frozenset[str]:
@@ -349,7 +350,6 @@ class Inria(InriaFamily):
     )
     stand_ins = "inria"
     shows_half_size = True
-    uses = (READS_GRADIENT, SETS_END)
 
     @classmethod
     def recognises(cls, names: Container[str]) -> bool:

@@ -98,14 +98,14 @@ class LiteGS(AbstractAdapter):
         self._names = [str(frame.name) for frame in loop["trainingset"].frames]
         self.output_folder = loop["lp"].model_path
         end, last = int(loop["dp"].densify_until) * views, int(loop["total_epoch"]) * views - 1
-        survey = Survey(self, [type(loop["density_controller"])], KNOWN, EVENTS, through=["step"])
+        survey = Survey(self, [type(loop["density_controller"])], KNOWN, EVENTS, [LOOP], through=["step"])
         survey.read(self._loop, "epoch", values=loop)
         hooks.ready(
             TrainerInfo(
                 survey.start_after_changes(end, last, unit=views),
                 view_names=self._names,
                 max_steps=last,
-                gradients_read_until=end,
+                gradients_read_until=max(end, survey.end_of_gradients(end, last, views)),
             )
         )
         return int(loop["epoch"]) * views

@@ -10,13 +10,14 @@ import inspect
 import math
 import textwrap
 from collections import ChainMap
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any
 
 import torch
 
+from skipgs_plug.adapters.gradient_checks import checked_gradients, expects_none
 from skipgs_plug.adapters.loop_names import (
     Scope,
     evaluated,
@@ -76,7 +77,8 @@ class CallReader:
     does a call of a function that only returns a condition.
 
     Args:
-        stops: Names of functions that are not read.
+        stops: Names of functions of which only the reads of gradients count.
+        gated: Names of the functions whose backward may be skipped. That of any other function always runs.
         windows: Names of functions `f(number, start, end, ...)` that return whether a number lies between two others.
             With a negative start it never does; with a negative end there is no end.
 
@@ -88,15 +90,18 @@ class CallReader:
         trainer: Functions of this code are read if a function calls them. Callers add to it.
     """
 
-    def __init__(self, stops: Iterable[str] = (), windows: Iterable[str] = ()) -> None:
+    def __init__(self, stops: Iterable[str] = (), gated: Iterable[str] = (), windows: Iterable[str] = ()) -> None:
         self.ends: dict[str, int | None] = {}
         self.asked: set[str] = set()
         self.passed_over: set[str] = set()
         self.trainer = TrainerCode()
-        self._stops, self._windows = frozenset(stops), frozenset(windows)
+        self._stops, self._gated, self._windows = frozenset(stops), frozenset(gated), frozenset(windows)
         self._open: list[CodeType] = []  # code of the functions that are being read, outermost first
-        self._expects_none = False  # whether a function that is being read compares a gradient with None
-        self._checked: set[ast.expr] = set()  # gradients that functions give a name, which they compare with None
+        # Whether reads of gradients need no training backward here: a condition around or before them compares a
+        # gradient with None, or a function around them has run a backward of its own.
+        self._gradient_safe = False
+        self._only_gradients = False  # inside a function of `stops`
+        self._checked: set[ast.expr] = set()  # gradients that functions compare with None
 
     def read(self, function: Any, numbers: Collection[str], values: Mapping[str, Any], end: int | None = None) -> None:
         """Read a function or a bound method.
@@ -112,13 +117,12 @@ class CallReader:
         syntax = None if plain is None else syntax_of(plain)
         if plain is None or syntax is None or plain.__code__ in self._open or len(self._open) == MAX_DEPTH:
             return
-        outer = self._expects_none
-        self._expects_none = outer or _expects_none(syntax)
-        self._checked.update(_checked_gradients(syntax))
+        outer = self._gradient_safe
+        self._checked.update(checked_gradients(syntax))
         self._open.append(plain.__code__)
         self._body(syntax.body, self._scope(function, plain, syntax, numbers, values), end)
         self._open.pop()
-        self._expects_none = outer
+        self._gradient_safe = outer
 
     @staticmethod
     def _scope(
@@ -133,34 +137,37 @@ class CallReader:
 
     def read_loops(self, function: ast.FunctionDef, scope: Scope) -> None:
         """Read the loops of a function, or all of it if it has none."""
-        scope, self._expects_none = scope_inside(function, scope), _expects_none(function)
-        self._checked.update(_checked_gradients(function))
+        scope = scope_inside(function, scope)
+        self._checked.update(checked_gradients(function))
         for body in [loop.body for loop in outermost_loops(function)] or [function.body]:
             self._body(body, scope, None)
 
     def _body(self, body: list[ast.stmt], scope: Scope, end: int | None) -> None:
         if end == 0:  # the body is never reached
             for statement in body:
-                _ask(statement, self.passed_over)
+                self._ask(statement, self.passed_over)
             return
         for statement in body:
             if isinstance(statement, (ast.If, ast.While)):
                 self._calls(statement.test, scope, end)
                 inside = _sooner(end, self._end(statement.test, scope))
                 decides = inside != 0 or statement.orelse
-                _ask(statement.test, self.asked if decides else self.passed_over)
+                self._ask(statement.test, self.asked if decides else self.passed_over)
                 after = _sooner(end, self._end(statement.test, scope, holds=False))
+                outer, self._gradient_safe = self._gradient_safe, self._gradient_safe or expects_none(statement.test)
                 self._body(statement.body, scope, inside)
                 self._body(statement.orelse, scope, after)
                 if isinstance(statement, ast.If) and isinstance(statement.body[-1], (ast.Return, ast.Continue)):
                     end = after
+                elif expects_none(statement.test):
+                    self._gradient_safe = outer
                 continue
             if isinstance(statement, ast.Match):
-                _ask(statement.subject, self.asked)
+                self._ask(statement.subject, self.asked)
                 self._calls(statement.subject, scope, end)
                 for case in statement.cases:
                     test = case_test(statement.subject, case)
-                    _ask(test, self.asked)
+                    self._ask(test, self.asked)
                     self._body(case.body, scope, _sooner(end, self._end(test, scope)))
                 continue
             if isinstance(statement, ast.For) and self._each(statement, scope, end):
@@ -169,7 +176,7 @@ class CallReader:
             blocks += [inner for handler in getattr(statement, "handlers", []) for inner in handler.body]
             learn_names(statement, scope)
             inner = {id(node) for block in blocks for node in ast.walk(block)}
-            _ask(statement, self.asked, inner)
+            self._ask(statement, self.asked, inner)
             self._calls(statement, scope, end, inner)
             self._body(blocks, scope, end)
 
@@ -191,12 +198,14 @@ class CallReader:
             # `absgrad` is also the name of an option, which MCMC's strategy does not have.
             owner = value_of(part.value, scope)
             is_option = owner is not None and not isinstance(owner, torch.Tensor)
-            expected = self._expects_none or part in self._checked or is_option
-            if use != READS_GRADIENT or not expected:
+            safe = self._gradient_safe or part in self._checked or is_option
+            if use != READS_GRADIENT or not safe:
                 self.note(use, end)
         elif isinstance(part, ast.Call):
             name = getattr(part.func, "attr", getattr(part.func, "id", None))
-            if name is not None:
+            if name == "backward" and self._open and self._open[-1].co_name not in self._gated:
+                self._gradient_safe = True
+            elif name is not None:
                 self.note(name, end)
                 self._follow(name, part, scope, end)
         for child in ast.iter_child_nodes(part):
@@ -213,21 +222,31 @@ class CallReader:
                 return True
         return False
 
+    def _ask(self, part: ast.AST, into: set[str], but: Collection[int] = ()) -> None:
+        """Record the attributes and texts in a statement or expression, except the nodes `but`."""
+        for node in () if self._only_gradients else ast.walk(part):
+            match node:
+                case ast.Attribute(attr=str(name)) | ast.Constant(str(name)) if id(node) not in but:
+                    into.add(name)
+
     def note(self, name: str, end: int | None) -> None:
         """Record a call that the loop no longer makes from iteration `end` on; None if the call has no end."""
+        if self._only_gradients and name != READS_GRADIENT:
+            return
         before = self.ends.get(name, 0)
         self.ends[name] = None if end is None or before is None else max(before, end)
 
     def _follow(self, name: str, call: ast.Call, scope: Scope, end: int | None) -> None:
-        if name in self._stops:
-            return
         call, function, syntax = self._called(call, scope)
         if syntax is None:
             return
+        outer = self._only_gradients
+        self._only_gradients = outer or name in self._stops
         if syntax.name != name:  # the loop has a name of its own for it: `prune = gaussians.prune_points`
             self.note(syntax.name, end)
-        if syntax.name not in self._stops:
-            self.read(function, *self._arguments(call, function, syntax, scope), end)
+        self._only_gradients |= syntax.name in self._stops
+        self.read(function, *self._arguments(call, function, syntax, scope), end)
+        self._only_gradients = outer
 
     def _called(self, call: ast.Call, scope: Scope) -> tuple[ast.Call, Any, ast.FunctionDef | None]:
         """Return a call, the function that it calls, and its syntax; None if that is no function of the trainer."""
@@ -309,6 +328,7 @@ def read_loops(
     values: Mapping[str, Any],
     trainer: Iterable[Part | None],
     stops: Iterable[str],
+    gated: Iterable[str],
 ) -> CallReader:
     """Read the loops of a function, and return what was found in them.
 
@@ -317,9 +337,10 @@ def read_loops(
         number: Variable of the loop that holds the iteration's number.
         values: Values of the loop's names when it begins.
         trainer: Functions and classes of the trainer, if known. Its other functions are read if the loop calls them.
-        stops: Names of functions that are not read.
+        stops: See `CallReader`.
+        gated: See `CallReader`.
     """
-    reader = CallReader(stops)
+    reader = CallReader(stops, gated)
     for part in trainer:
         if part is not None:
             reader.trainer.add(part)
@@ -335,38 +356,6 @@ def function_of(source: Path | Any, name: str) -> ast.FunctionDef | None:
     except (OSError, TypeError, ValueError, SyntaxError):
         return None
     return next((node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == name), None)
-
-
-def _ask(part: ast.AST, into: set[str], but: Collection[int] = ()) -> None:
-    """Record the attributes and texts in a statement or expression, except the nodes `but`."""
-    for node in ast.walk(part):
-        match node:
-            case ast.Attribute(attr=str(name)) | ast.Constant(str(name)) if id(node) not in but:
-                into.add(name)
-
-
-def _expects_none(function: ast.FunctionDef) -> bool:
-    """Whether a function asks somewhere whether there is a gradient."""
-    return any(isinstance(side, ast.Attribute) and side.attr == "grad" for side in _compared_with_none(function))
-
-
-def _checked_gradients(function: ast.FunctionDef) -> Iterator[ast.expr]:
-    """Yield the gradients in a function that it gives a name, as in `grad = means.grad`, `if grad is None`."""
-    names = {side.id for side in _compared_with_none(function) if isinstance(side, ast.Name)}
-    for statement in ast.walk(function):
-        match statement:
-            case ast.Assign([ast.Name(name)], ast.Attribute(attr="grad") as value) if name in names:
-                yield value
-
-
-def _compared_with_none(function: ast.FunctionDef) -> Iterator[ast.expr]:
-    """Yield what a function compares with None, but not in an `assert`: it expects no None."""
-    asserted = {part for node in ast.walk(function) if isinstance(node, ast.Assert) for part in ast.walk(node)}
-    for node in ast.walk(function):
-        if isinstance(node, ast.Compare) and node not in asserted:
-            sides = [node.left, *node.comparators]
-            if any(isinstance(side, ast.Constant) and side.value is None for side in sides):
-                yield from sides
 
 
 def _sooner(one: int | None, other: int | None) -> int | None:

@@ -24,11 +24,12 @@ class Scope(NamedTuple):
         numbers: Expressions that hold the iteration's number, as spelled by `ast.unparse`.
         values: Values of names when the loop begins.
         code: Code of the function; None for the loop of a script.
-        once: Names that the function assigns in one place only.
+        once: Names and attributes that the function assigns in one place only.
         own: Parameters of the function, and all names that it assigns.
         varying: Names and attributes that iterations assign, so that `values` may hold another iteration's.
         known: Values of names in `once`, after they were assigned.
-        meanings: Expressions for which names in `once` stand, after they were assigned.
+        meanings: Expressions for which names in `once` stand, after they were assigned. Attributes are among them if
+            they hold the iteration's number.
     """
 
     numbers: frozenset[str]
@@ -44,16 +45,16 @@ class Scope(NamedTuple):
 def scope_inside(function: ast.FunctionDef, scope: Scope) -> Scope:
     """Return the scope at the beginning of a function."""
     maps = scope.values.maps if isinstance(scope.values, ChainMap) else [scope.values]
-    names = Counter(stored(function))
+    names, attributes = Counter(stored(function)), Counter(stored(function, ast.Attribute))
     in_loops = {name for loop in outermost_loops(function) for name in stored(loop)}
     arguments = function.args
     parameters = {one.arg for one in (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs)}
     known: dict[str, Any] = {}
     return scope._replace(
         values=ChainMap(known, *maps),
-        once=frozenset(name for name, count in names.items() if count == 1),
+        once=frozenset(place for place, count in (names + attributes).items() if count == 1),
         own=frozenset(parameters | names.keys()),
-        varying=frozenset(in_loops.union(names.keys() - maps[0].keys(), stored(function, ast.Attribute))),
+        varying=frozenset(in_loops.union(names.keys() - maps[0].keys(), attributes)),
         known=known,
         meanings={},
     )
@@ -67,6 +68,8 @@ def learn_names(statement: ast.stmt, scope: Scope) -> None:
             if found is not None:
                 scope.known[target.id] = found
             scope.meanings[target.id] = value
+        elif ast.unparse(target) in scope.once and offset_of(value, scope) is not None:  # self.step = step
+            scope.meanings[ast.unparse(target)] = value
 
 
 def named(name: str, value: Any, scope: Scope) -> ast.expr:
@@ -118,8 +121,8 @@ def offset_of(node: ast.expr, scope: Scope) -> int | None:
     if ast.unparse(node) in scope.numbers:
         return 0
     match node:
-        case ast.Name(name) if name in scope.meanings:
-            return offset_of(scope.meanings[name], without(name, scope))
+        case ast.Name() | ast.Attribute() if (place := ast.unparse(node)) in scope.meanings:
+            return offset_of(scope.meanings[place], without(place, scope))
         case ast.NamedExpr(_, value):
             return offset_of(value, scope)
         case ast.BinOp(place, ast.Add() | ast.Sub() as sign, ast.Constant(int(by))):

@@ -92,7 +92,7 @@ class Nerfstudio(AbstractAdapter):
             return camera, batch
 
         strategy = getattr(pipeline.model, "strategy", None)
-        survey = survey_of(self, strategy, type(pipeline.model), through=CALLBACKS)
+        survey = survey_of(self, LOOP, strategy, type(pipeline.model), through=CALLBACKS)
         survey.read(trainer.train, "step")
         for callback, end in callbacks(trainer):
             survey.read(callback, "step", "self.step", end=end)

@@ -101,7 +101,7 @@ class ThreeDGRUT(AbstractAdapter):
                 hooks.view(int(batch.frame_idx) if names is None else names[int(batch.frame_idx)])
 
         strategy = trainer.strategy
-        survey = Survey(self, [type(strategy), type(trainer.model)], KNOWN, EVENTS, THROUGH, windows=[WINDOW])
+        survey = Survey(self, [type(strategy), type(trainer.model)], KNOWN, EVENTS, [STEP], THROUGH, [WINDOW])
         survey.read(getattr(trainer, STEP), "global_step")
         hooks.wrap(trainer, STEP, stepped)
         hooks.before(strategy, "pre_backward", told)
@@ -111,8 +111,9 @@ class ThreeDGRUT(AbstractAdapter):
         hooks.gate_tensor_backward(STEP)
         self.output_folder = getattr(getattr(trainer, "tracking", None), "output_dir", None)
         end, last = last_change(trainer.conf.strategy), int(trainer.conf.n_iterations) - 1
+        read_until = max(end, survey.end_of_gradients(end, last))
         start = survey.start_after_changes(end, last)
-        hooks.ready(TrainerInfo(start, view_names=names, max_steps=last, gradients_read_until=end))
+        hooks.ready(TrainerInfo(start, view_names=names, max_steps=last, gradients_read_until=read_until))
 
 
 def last_change(strategy: Any) -> int:

@@ -162,11 +162,12 @@ def refuse_loop_elsewhere(code: LoopCode, who: str) -> None:
         )
 
 
-def refuse_loop_without_end(ends: Mapping[str, int | None], last: float, who: str) -> None:
+def refuse_loop_without_end(ends: Mapping[str, int | None], start: float, last: float, who: str) -> None:
     """Raise an error if a loop reads gradients until its end, or sets the end of densification itself.
 
     Args:
         ends: See `CallReader`.
+        start: First iteration after densification, according to the options. A run may end before it.
         last: Last iteration of the run.
         who: Start of the message.
 
@@ -180,7 +181,7 @@ def refuse_loop_without_end(ends: Mapping[str, int | None], last: float, who: st
             f"densification ends. {BY_HAND}"
         )
     until = ends.get(READS_GRADIENT, 0)
-    if until is None or until > last:
+    if until is None or (until > start and until >= last):
         raise AdapterMismatchError(
             f"{who}: its loop reads gradients (grad) until its end, for example to log them or to densify, and a "
             "skipped iteration has none. Switch that off if the script has an option for it, such as one for the log. "
@@ -199,8 +200,9 @@ class Survey:
         owners: Classes and modules whose functions change the model.
         known: Functions of the owners that the adapter's trainer calls.
         changes: Functions of the owners that the adapter's trainer calls to change the model until densification ends.
-        through: Functions of the owners that call such changes in some iterations. They are read; no other functions
-            of the owners are.
+        gated: See `CallReader`.
+        through: Functions of the owners that call such changes in some iterations. Of all other functions of the
+            owners, only the reads of gradients count.
         windows: See `CallReader`.
     """
 
@@ -210,6 +212,7 @@ class Survey:
         owners: Iterable[Any],
         known: Iterable[str],
         changes: Iterable[str],
+        gated: Iterable[str],
         through: Iterable[str] = (),
         windows: Collection[str] = (),
     ) -> None:
@@ -218,7 +221,7 @@ class Survey:
         self._known = self._changes.union(known, through)
         owners = list(owners)
         self._methods = {ASSIGNED}.union(*map(_callables, owners))
-        self._reader = CallReader(self._methods.difference(through), windows)
+        self._reader = CallReader(self._methods.difference(through), gated, windows)
         for owner in owners:
             self._reader.trainer.add(owner)
 
@@ -247,17 +250,20 @@ class Survey:
         called = self._reader.ends.keys() & self._methods - self._known
         return sorted(changing(called))
 
-    def end_of_gradients(self, last: float) -> int | None:
-        """Return the first iteration from which on the trainer reads no gradients; None if it never reads any.
+    def end_of_gradients(self, start: int, last: float = math.inf, unit: int = 1) -> int:
+        """Return the first iteration from which on the trainer reads no gradients; 0 if it never reads any.
 
         Args:
-            last: Last iteration of the run.
+            start: First iteration after densification, according to the trainer's options; 0 if they do not tell it.
+            last: Last iteration of the run; infinite if unknown.
+            unit: See `start_after_changes`.
 
         Raises:
             AdapterMismatchError: It reads them until the end of the run, or moves the end of its densification.
         """
-        refuse_loop_without_end(self._reader.ends, last, f"Adapter {self._adapter.name!r} cannot gate this trainer")
-        return self._reader.ends.get(READS_GRADIENT)
+        ends = self._ends(unit)
+        refuse_loop_without_end(ends, start, last, f"Adapter {self._adapter.name!r} cannot gate this trainer")
+        return ends.get(READS_GRADIENT) or 0
 
     def start_after_changes(self, start: int, last: float = math.inf, unit: int = 1) -> int:
         """Return the later of `start` and the end of the last change of the model, known or unknown.
@@ -277,8 +283,11 @@ class Survey:
                 f"{', '.join(recognised)}. {left_alone(map(spelled, self.unknown))}"
             )
         names = self._changes.union(self.unknown, [READS_GRADIENT])
-        ends = {name: end * unit for name, end in self._reader.ends.items() if end is not None and name in names}
+        ends = {name: end for name, end in self._ends(unit).items() if end is not None and name in names}
         return begin_after(start, last, ends)
+
+    def _ends(self, unit: int) -> dict[str, int | None]:
+        return {name: None if end is None else end * unit for name, end in self._reader.ends.items()}
 
 
 def changing(names: Iterable[str]) -> set[str]:
