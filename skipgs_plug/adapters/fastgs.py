@@ -44,7 +44,6 @@ class FastGS(InriaFamily):
     calls = ("optimizer_step",)
     arguments = ("get_flag", "metric_map")
     renders = ("render_fastgs",)
-    pure = ("optimizer_step",)
     # Each event caps opacities at 0.8 and replaces their moments.
     densification = Densification(marks=("densification_interval",), reset_marks=RESETS, clears_moments=True)
 
