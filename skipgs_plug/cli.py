@@ -140,8 +140,8 @@ def run(arguments: list[str], whole_program: bool) -> int:
         args = importlib.import_module(f"skipgs_plug.commands.options.{name}").parse(rest)
         with uncollected() if whole_program else contextlib.nullcontext():
             command = importlib.import_module(f"skipgs_plug.commands.{name}")
-        if whole_program:
-            keep_everything()
+            if whole_program:
+                keep_everything()
         return command.run(args)
     if name and not name.startswith("-"):
         return fail(f"There is no command {name!r}; the commands are {', '.join(COMMANDS)}.")
