@@ -51,14 +51,15 @@ def are_photographs(source: Path) -> bool:
         return source.suffix.lower() in VIDEO_SUFFIXES
     if not source.is_dir() or is_scene(source):
         return False
-    return bool(photographs(source))
+    return any(True for _ in photographs(source))  # the first one is enough
 
 
-def photographs(folder: Path) -> list[Path]:
-    """Return the photographs in a folder and its subfolders, sorted, also those in formats that cannot be read."""
+def photographs(folder: Path) -> Iterator[Path]:
+    """Yield the photographs in a folder and its subfolders, also those in formats that cannot be read."""
     known = AS_THEY_ARE + CONVERTED + UNREADABLE
-    found = [path for path in walk(folder) if path.suffix.lower() in known and not path.name.startswith(".")]
-    return sorted(path for path in found if not path.is_dir())
+    for path in walk(folder):
+        if path.suffix.lower() in known and not path.name.startswith(".") and not path.is_dir():
+            yield path
 
 
 def walk(folder: Path) -> Iterator[Path]:
@@ -126,7 +127,7 @@ def gather_video(source: Path, folder: Path, frames: int, progress: Callable[[in
 
 
 def gather_folder(source: Path, folder: Path, progress: Callable[[int], None]) -> Gathered:
-    files = photographs(source)
+    files = sorted(photographs(source))
     unreadable = [path for path in files if path.suffix.lower() in UNREADABLE]
     if unreadable:
         others = f" ({len(unreadable) - 1} more of this kind)" if len(unreadable) > 1 else ""

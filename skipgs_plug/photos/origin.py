@@ -26,7 +26,7 @@ def origin_of(source: Path) -> Origin:
     if source.is_file():
         return Origin(str(source), {source.name: source.stat().st_size})
     # `gather` refuses links to files that do not exist, with a sentence of its own.
-    sizes = {path: path.stat().st_size if path.exists() else 0 for path in photographs(source)}
+    sizes = {path: path.stat().st_size if path.exists() else 0 for path in sorted(photographs(source))}
     return Origin(str(source), {path.relative_to(source).as_posix(): size for path, size in sizes.items()})
 
 
