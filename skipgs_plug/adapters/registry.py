@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from skipgs_plug.adapters.base import AbstractAdapter
 from skipgs_plug.adapters.loop_code import LoopCode
-from skipgs_plug.core.errors import SkipGSError, UnknownTrainerError
+from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError, UnknownTrainerError
 
 # In the order in which they are tried: a fork stands before its parent. Modules are imported when they are tried.
 BUILTIN = {
@@ -47,6 +49,7 @@ BUILTIN = {
 }
 
 SHOWN = 6  # functions of an unknown script that the error names, at most: it stays one sentence
+SCRIPT_NAME = re.compile(r"[\w./-]+\.py\b")
 
 _registered: dict[str, type[AbstractAdapter]] = {}
 
@@ -133,10 +136,15 @@ def find_script_adapter(script: Path) -> type[AbstractAdapter]:
         UnknownTrainerError: No adapter knows it.
     """
     code = LoopCode.of_script(script)
-    for candidate in adapter_names():
-        adapter = get_adapter(candidate)
-        if adapter.recognises_script(code):
-            return adapter
+    if (adapter := _recognising(code)) is not None:
+        return adapter
+    if not code.calls_backward and (started := _training_scripts_named_in(script)):
+        names = _listed(started)
+        raise UnknownTrainerError(
+            f"{script} holds no training loop, but names {names}, which no gate reaches in a process of its own: start "
+            f"skipgs-plug run ADAPTER -- {started[0]} yourself, or write skipgs-plug run ADAPTER -- in place of python "
+            f"in a copy of {script.name}."
+        )
     advice = "gate that loop"
     if code.used:
         found, advice = "a function training(), but no GaussianModel", "gate its loop"
@@ -152,6 +160,29 @@ def find_script_adapter(script: Path) -> type[AbstractAdapter]:
         f"No adapter knows {script}, which has {found}: {advice} by hand with SkipGate(start_iter=...) and "
         "gate.backward(loss, view, step), as in docs/gate.md, or write an adapter (CONTRIBUTING.md)."
     )
+
+
+def _recognising(code: LoopCode) -> type[AbstractAdapter] | None:
+    """Return the first adapter that recognises a script."""
+    adapters = map(get_adapter, adapter_names())
+    return next((adapter for adapter in adapters if adapter.recognises_script(code)), None)
+
+
+def _training_scripts_named_in(driver: Path) -> list[str]:
+    """Return the training scripts whose files a script names in its texts, as one does that starts them."""
+    texts = [node.value for node in ast.walk(ast.parse(driver.read_bytes())) if isinstance(node, ast.Constant)]
+    words = {word for text in texts if isinstance(text, str) for word in SCRIPT_NAME.findall(text)}
+    return sorted(word for word in words if _is_training_script(word, driver))
+
+
+def _is_training_script(word: str, driver: Path) -> bool:
+    file = next((path for path in (Path(word), driver.parent / word) if path.is_file()), None)
+    if file is None or file.samefile(driver):
+        return False
+    try:
+        return _recognising(LoopCode.of_script(file)) is not None
+    except (AdapterMismatchError, OSError):  # it is not Python, or cannot be read
+        return False
 
 
 def _listed(names: Iterable[str]) -> str:

@@ -21,7 +21,7 @@ from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.messages import say
 from skipgs_plug.scripts.import_hints import install_hint
 from skipgs_plug.scripts.stand_in_hints import stand_in_hint
-from skipgs_plug.scripts.wrappers import wrapper_hint
+from skipgs_plug.scripts.wrappers import program_hint, wrapper_hint
 
 PACKAGE = Path(__file__).parents[1]
 Attach = Callable[[], dict[str, Any]]  # see `run_script`
@@ -129,6 +129,8 @@ def _resolve(command: Sequence[str]) -> _Program:
         return _Program([str(file), *arguments], commands, module, functools.partial(_call, installed))
     if script.is_dir():
         raise SkipGSError(f"{script} is a folder: name the training script in it after '--'.")
+    if (instead := program_hint(name)) is not None:
+        raise SkipGSError(instead)
     raise SkipGSError(f"There is no script {script}: name the training script after '--'.")
 
 

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 PYTHON = re.compile(r"python(\d+(\.\d+)?)?(\.exe)?")
 SHELLS = {"bash", "sh", "zsh", "fish"}
 LAUNCHERS = {"torchrun", "accelerate", "deepspeed", "fabric"}  # they start processes, each of which needs a gate
+VARIABLE = re.compile(r"[A-Za-z_]\w*=")
+SHEBANG_LENGTH = 256  # bytes of a program's first line that Linux reads
 
 
 def wrapper_hint(name: str) -> str | None:
     """Return how to write a command that begins with this word; None if the word is no program that starts scripts."""
     word = Path(name)
+    if name.startswith("-"):
+        return (
+            f"{name} is no script: the first word after '--' is the training script; options of skipgs-plug go before "
+            "'--', and those of Python follow python, as in python -u -m skipgs_plug run ADAPTER -- train.py."
+        )
+    if VARIABLE.match(name):
+        return f"{name} sets a variable of the environment: write it before skipgs-plug, not after '--'."
     if PYTHON.fullmatch(word.name):
         return f"Leave out {name}: write after '--' what follows it, for example -- train.py -s data."
     if word.name in SHELLS or word.suffix == ".sh":
@@ -26,3 +36,24 @@ def wrapper_hint(name: str) -> str | None:
             "-m skipgs_plug run ADAPTER -- train.py (docs/gate.md)."
         )
     return None
+
+
+def program_hint(name: str) -> str | None:
+    """Return how to write a command that begins with this program; None if the word is no program on this machine."""
+    program = shutil.which(name)
+    if program is None:
+        return None
+    try:
+        with open(program, "rb") as file:
+            first_line = file.read(SHEBANG_LENGTH).partition(b"\n")[0]
+    except OSError:  # it may be executed, but not read
+        first_line = b""
+    if first_line.startswith(b"#!") and b"python" in first_line:
+        return (
+            f"{program} belongs to another Python than the one that runs skipgs-plug: install skipgs-plug there too, "
+            "and run it from there."
+        )
+    return (
+        f"{name} is a program, and no Python script: let it start skipgs-plug, as in {name} ... skipgs-plug run "
+        "ADAPTER -- train.py."
+    )

@@ -82,3 +82,24 @@ def test_every_built_in_adapter_loads_under_its_name(name: str) -> None:
         r".*\w \([^()]*\w\)", adapter.checked
     )  # names the checked commit, and in brackets how it was checked
     assert not adapter.matches(object())
+
+
+def test_a_script_that_starts_training_scripts_is_told_to_name_them(tmp_path, monkeypatch) -> None:
+    loop = "def training(opt):\n    GaussianModel()\n    for iteration in range(9):\n        loss.backward()\n"
+    (tmp_path / "train.py").write_text(loop)
+    (tmp_path / "render.py").write_text("def render_sets(): ...\n")
+    (tmp_path / "broken.py").write_text("def training(:\n")
+    driver = tmp_path / "scripts/full_eval.py"
+    driver.parent.mkdir()
+    commands = ["python train.py -s {scene}", "python render.py -m out", "python broken.py", "python absent.py"]
+    driver.write_text(f"import os\nfor scene in 'ab':\n    [os.system(one) for one in {commands}]\n")
+    monkeypatch.chdir(tmp_path)  # such commands begin in the folder of the checkout
+    with pytest.raises(UnknownTrainerError, match=r"full_eval.py holds no training loop, but names train.py, which"):
+        registry.find_script_adapter(driver)
+    own = tmp_path / "full_eval.py"  # files may also be beside the script
+    own.write_text("name = 'train.py'\nos.system(f'python {name} -s x')\nprint('full_eval.py: done')\n")
+    monkeypatch.chdir("/")
+    with pytest.raises(UnknownTrainerError, match=r"write skipgs-plug run ADAPTER -- in place of python in a copy of"):
+        registry.find_script_adapter(own)
+    with pytest.raises(UnknownTrainerError, match=r"which has no function training\(\), but render_sets: name the"):
+        registry.find_script_adapter(tmp_path / "render.py")

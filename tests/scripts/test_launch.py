@@ -176,11 +176,24 @@ def test_an_installed_command_fails_as_itself(installed, capfd):
         (["bash", "run.sh"], "bash is not Python: write skipgs-plug run ADAPTER -- in place of python"),
         (["scripts/run.sh"], "scripts/run.sh is not Python"),
         (["torchrun", "--nproc_per_node", "2", "train.py"], "torchrun ... -m skipgs_plug run ADAPTER -- train.py"),
+        (["-u", "train.py"], "-u is no script: .* those of Python follow python, as in python -u -m skipgs_plug run"),
+        (["--cpu", "train.py"], "--cpu is no script: .* options of skipgs-plug go before '--'"),
+        (["CUDA_VISIBLE_DEVICES=0", "python", "train.py"], "CUDA_VISIBLE_DEVICES=0 sets a variable .* before skipgs"),
+        (["env", "train.py"], "env is a program, .* as in env ... skipgs-plug run ADAPTER -- train.py"),
     ],
 )
 def test_nothing_to_run_is_said(command, message):
     with pytest.raises(SkipGSError, match=message):
         run_script(command)
+
+
+def test_a_command_of_another_python_is_named(tmp_path, monkeypatch):
+    program = tmp_path / "train-elsewhere"
+    program.write_text("#!/elsewhere/bin/python3\nimport trainer\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(SkipGSError, match=f"{program} belongs to another Python .* install skipgs-plug there too"):
+        run_script(["train-elsewhere", "--data", "garden"])
 
 
 def test_the_source_of_a_module_is_found_without_importing_its_packages(checkout, monkeypatch):
