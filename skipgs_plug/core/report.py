@@ -117,7 +117,7 @@ def summarise(config: SkipConfig, counted: dict[str, Any]) -> str:
 def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
     run, skipped = counted["iterations_run"], counted["iterations_skipped"]
     start = config.start_iter or 0
-    lines = [] if counted["growing"] is None else [_summarise_growing(counted["growing"])]
+    lines = [] if counted["growing"] is None else [_summarise_growing(counted["growing"], ended=not run + skipped)]
     if not run + skipped:
         return "\n".join([*lines, f"SkipGS: no iteration of refinement, which begins at iteration {start:,}."])
     percent = 100 * run / (run + skipped)
@@ -159,7 +159,8 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _summarise_growing(growing: dict[str, Any]) -> str:
+def _summarise_growing(growing: dict[str, Any], ended: bool) -> str:
+    """Return the lines about the growing phase; `ended` says that the run ended in it, as after Ctrl-C."""
     run, skipped = growing["iterations_run"], growing["iterations_skipped"]
     percent = 100 * run / (run + skipped) if run + skipped else 100.0
     factor = growing["rate_factor"]
@@ -167,7 +168,7 @@ def _summarise_growing(growing: dict[str, Any]) -> str:
     return (
         f"SkipGS: {run:,} of {run + skipped:,} iterations run ({percent:.1f} %) while the scene grows, with "
         f"{growing['events_run']:,} of {growing['events_run'] + growing['events_skipped']:,} densification "
-        f"events{longer}.{_why_more(growing)}{_random_points(growing)}{_half_size(growing)}"
+        f"events{longer}.{_why_more(growing, ended)}{_random_points(growing)}{_half_size(growing)}"
     )
 
 
@@ -188,7 +189,7 @@ def _half_size(growing: dict[str, Any]) -> str:
     return f"\n  photographs had half their size until iteration {until:,}{kept}"
 
 
-def _why_more(growing: dict[str, Any]) -> str:
+def _why_more(growing: dict[str, Any], ended: bool) -> str:
     """Return a line that says why more than the share of the growing phase ran; empty if it did not."""
     run, asked = growing["iterations_run"], growing["iterations_run"] + growing["iterations_skipped"]
     times = growing["times_grown"]
@@ -196,7 +197,7 @@ def _why_more(growing: dict[str, Any]) -> str:
         return ""
     return (
         f"\n  this is more than the share of {growing['share']:.2f}, because the scene grew to {times:.1f} times its "
-        "Gaussians, or because conditions of the loop need iterations"
+        f"Gaussians, or because conditions of the loop need iterations{', or because the run ended early' * ended}"
     )
 
 

@@ -267,9 +267,11 @@ class Multiplies(Loop):
         self.growth, self.means = growth, torch.nn.Parameter(torch.rand(100, 3))
         self.optimizer = torch.optim.Adam([{"params": [self.means], "name": "xyz"}], lr=0.1)
 
-    def train(self, gate):
+    def train(self, gate, until=6000):
         for step in gate.iterations(range(6000), views=VIEWS, events=range(20, 3000, 20)):
             self.ran.append(step)
+            if step >= until:
+                break
             if gate.backward(self.means.square().sum(), view=VIEWS[step % 4], step=step):
                 self.optimizer.step()
                 self.optimizer.zero_grad(set_to_none=True)
@@ -288,6 +290,7 @@ def test_a_scene_that_grows_strongly_gets_more_iterations_in_both_phases():
             loops[growth] = Multiplies(growth).train(gate)
         reports[growth] = gate.report()
         assert ("because the scene grew to 100.0 times" in gate.summary()) is (growth == 0.1)
+        assert "ended early" not in gate.summary()
     still, little, much = (reports[growth] for growth in (0.0, 0.01, 0.1))
     assert little["growing"]["iterations_run"] == pytest.approx(still["growing"]["iterations_run"], abs=2)
     assert still["growing"]["iterations_run"] < much["growing"]["iterations_run"] <= 0.41 * 3000  # the bound is 0.4
@@ -335,3 +338,9 @@ def test_resets_run_and_need_events():
         gate.iterations(range(LAST), views=VIEWS, resets=[])
     with gate:
         assert {151, 307} <= set(Loop().train(gate, resets=[151, 307]).ran)
+
+
+def test_a_run_that_ends_while_the_scene_grows_says_so():
+    with SkipGate(start_iter=3000, share="auto") as gate:
+        Multiplies(0.1).train(gate, until=500)
+    assert "conditions of the loop need iterations, or because the run ended early" in gate.summary()
