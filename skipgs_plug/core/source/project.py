@@ -13,6 +13,7 @@ from typing import Any
 
 STANDARD = frozenset(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib"))
 INSTALLED = frozenset({"site-packages", "dist-packages"})  # names of folders that hold installed packages
+FROZEN = "<frozen "  # beginning of the file name in code of the standard library that Python itself holds, as os.path
 _LIBRARIES = STANDARD | {Path(__file__).resolve().parents[2]}
 
 
@@ -59,6 +60,8 @@ def import_folder(file: Path, module: str) -> Path | None:
 
 @functools.cache
 def _is_below(file: str, folder: Path) -> bool:
+    if file.startswith(FROZEN):  # as a path, it would lie in the working folder
+        return False
     path = Path(file).resolve()
     library = not INSTALLED.isdisjoint(path.parts) or not _LIBRARIES.isdisjoint(path.parents)
     return folder in path.parents and not library
