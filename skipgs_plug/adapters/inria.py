@@ -158,7 +158,8 @@ class InriaFamily(MarkedScript):
         if not code.used:
             raise AdapterMismatchError(
                 f"Adapter {self.name!r} expects a function {LOOP}(), which {code.source} does not have; name the "
-                f"script that has it, or give SkipGate its module (docs/gate.md). It was checked with {self.checked}."
+                "script that has it, run this one with --no-gate if it does not train, or give SkipGate the module of "
+                f"the function (docs/gate.md). It was checked with {self.checked}."
             )
         self.require_own(code)
         refuse_loop_elsewhere(code, self.difference(code))

@@ -155,7 +155,8 @@ def find_script_adapter(script: Path) -> type[AbstractAdapter]:
     else:
         functions = [name for name in code.functions if not name.startswith("_")]
         found = f"no function training(), but {_listed(functions)}" if functions else "no function at all"
-        advice = "name the script that holds the training loop, gate that loop"
+        named = "name the script that holds the training loop"
+        advice = f"run it with --no-gate if it does not train, {named}, gate that loop"
     raise UnknownTrainerError(
         f"No adapter knows {script}, which has {found}: {advice} by hand with SkipGate(start_iter=...) and "
         "gate.backward(loss, view, step), as in docs/gate.md, or write an adapter (CONTRIBUTING.md)."
@@ -177,12 +178,24 @@ def _training_scripts_named_in(driver: Path) -> list[str]:
 
 def _is_training_script(word: str, driver: Path) -> bool:
     file = next((path for path in (Path(word), driver.parent / word) if path.is_file()), None)
-    if file is None or file.samefile(driver):
-        return False
+    return file is not None and not file.samefile(driver) and _adapter_of(file) is not None
+
+
+def _adapter_of(file: Path) -> type[AbstractAdapter] | None:
     try:
-        return _recognising(LoopCode.of_script(file)) is not None
+        return _recognising(LoopCode.of_script(file))
     except (AdapterMismatchError, OSError):  # it is not Python, or cannot be read
-        return False
+        return None
+
+
+def find_adapter_beside(script: Path) -> type[AbstractAdapter] | None:
+    """Return the adapter of the trainer to which a script without a training loop belongs, such as its render.py.
+
+    It is the adapter of train.py in the same folder, or else of all training scripts there; None if they have several.
+    """
+    trains = script.with_name("train.py")
+    found = {_adapter_of(file) for file in ([trains] if trains.is_file() else script.parent.glob("*.py"))} - {None}
+    return found.pop() if len(found) == 1 else None
 
 
 def _listed(names: Iterable[str]) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 
 from skipgs_plug import SkipGate, SkipGSError, UnknownTrainerError
 from skipgs_plug.adapters.base import AbstractAdapter
-from skipgs_plug.adapters.registry import find_script_adapter, get_adapter
+from skipgs_plug.adapters.registry import find_adapter_beside, find_script_adapter, get_adapter
 from skipgs_plug.commands.options.gate import GateOptions
 from skipgs_plug.commands.options.run import Args
 from skipgs_plug.compat import FAMILIES, serve
@@ -89,6 +89,8 @@ def find_adapter(args: Args, command: list[str]) -> str | None:
         if not args.no_gate:
             raise
         if args.cpu:
+            if (beside := find_adapter_beside(source_of(command))) is not None:
+                return beside.name
             raise UnknownTrainerError(
                 f"--cpu replaces the CUDA modules of trainers that an adapter knows, and none knows "
                 f"{script_name(command)}: run it without --cpu, or name the adapter of the trainer that it was forked "

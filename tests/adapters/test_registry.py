@@ -101,5 +101,5 @@ def test_a_script_that_starts_training_scripts_is_told_to_name_them(tmp_path, mo
     monkeypatch.chdir("/")
     with pytest.raises(UnknownTrainerError, match=r"write skipgs-plug run ADAPTER -- in place of python in a copy of"):
         registry.find_script_adapter(own)
-    with pytest.raises(UnknownTrainerError, match=r"which has no function training\(\), but render_sets: name the"):
+    with pytest.raises(UnknownTrainerError, match=r"which has no function training\(\), but render_sets: run it"):
         registry.find_script_adapter(tmp_path / "render.py")

@@ -54,6 +54,27 @@ def test_no_gate_runs_a_script_that_no_adapter_knows(tmp_path, capfd):
     assert "an adapter knows, and none knows train.py: run it without --cpu" in capfd.readouterr().err
 
 
+def test_a_script_beside_the_training_script_runs_on_the_cpu_without_a_gate(checkout, capfd):
+    render = Path(checkout).with_name("render.py")
+    render.write_text(
+        "import torch\n"
+        "from gaussian_renderer import GaussianRasterizer\n"
+        "print(GaussianRasterizer.__module__, torch.zeros(2).cuda().device)\n"
+    )
+    assert cli.main(["run", "auto", "--cpu", "--", str(render)]) == cli.BAD_INPUT
+    assert "render.py, which has no function at all: run it with --no-gate" in capfd.readouterr().err
+    assert cli.main(["run", "auto", "--cpu", "--no-gate", "--", str(render)]) == 0
+    out, error = capfd.readouterr()
+    assert out.startswith("skipgs_plug.compat.") and out.endswith(" cpu\n")
+    assert "render.py is run as inria." in error
+    # Without a train.py, all training scripts of the folder must have one adapter.
+    Path(checkout).rename(render.with_name("train_one.py"))
+    assert cli.main(["run", "auto", "--cpu", "--no-gate", "--", str(render)]) == 0
+    mark = "def training(opt):\n    GaussianModel(build_scaling_rotation)\n    loss.backward()\n"
+    render.with_name("train_two.py").write_text(mark)
+    assert cli.main(["run", "auto", "--cpu", "--no-gate", "--", str(render)]) == cli.BAD_INPUT
+
+
 def test_auto_recognises_the_script_before_it_runs(checkout, tmp_path, capfd):
     assert cli.main(["run", "auto", "--cpu", "--warmup", "10", "--", checkout, str(tmp_path)]) == 0
     assert "skipgs-plug: train.py is run as inria." in capfd.readouterr().err
@@ -62,7 +83,8 @@ def test_auto_recognises_the_script_before_it_runs(checkout, tmp_path, capfd):
     other.write_text("def main():\n    pass\n")
     assert cli.main(["run", "auto", "--", str(other)]) == cli.BAD_INPUT
     error = capfd.readouterr().err
-    assert "other.py, which has no function training(), but main: name the script that holds the training loop" in error
+    assert "other.py, which has no function training(), but main: run it with --no-gate if it does not train" in error
+    assert "name the script that holds the training loop" in error
     assert "name one of" not in error and error.count("\n") == 1
     other.write_text("def training():\n    model = OwnModel()\n    model.loss().backward()\n")
     assert cli.main(["run", "auto", "--", str(other)]) == cli.BAD_INPUT
@@ -88,7 +110,7 @@ def test_only_calls_of_backward_and_named_functions_are_named(tmp_path, capfd):
     script = tmp_path / "own.py"
     script.write_text("class Render:\n    def backward(context, gradient):\n        return gradient\nf = lambda: 10\n")
     assert cli.main(["run", "auto", "--", str(script)]) == cli.BAD_INPUT
-    assert "no function training(), but Render: name the script" in capfd.readouterr().err
+    assert "no function training(), but Render: run it" in capfd.readouterr().err
 
 
 def test_wrong_adapter_is_refused_before_anything_is_imported(checkout, tmp_path, capfd):
