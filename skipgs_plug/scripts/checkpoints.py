@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import os
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,13 +21,15 @@ from skipgs_plug.messages import say
 # Functions that `watch` replaces. `run_script` replaces `torch.load` too.
 REPLACED = ("torch.save", "torch.load")
 SUFFIX = ".skipgs.json"  # appended to the name of the checkpoint
+TAIL = 65_536  # bytes at the end of a checkpoint; PyTorch lists the checksums of all its tensors there
 
 
 class Checkpoints:
     """Writes the gate's state next to every file that the script saves with `torch.save`.
 
     When the script loads such a file with `torch.load` and continues with the next iteration, the gate continues
-    too. If a state belongs to another script or iteration, the gate ignores it and prints a message.
+    too. If a state belongs to another script or iteration, or to an earlier file of that name, the gate ignores it and
+    prints a message.
 
     Args:
         adapter: Name of the adapter.
@@ -56,7 +59,8 @@ class Checkpoints:
         def save_both(obj: Any, f: Any, *args: Any, **kwargs: Any) -> None:
             save(obj, f, *args, **kwargs)
             if (path := _path_of(f)) is not None:
-                self._save_beside(path)
+                # An open file may hold bytes that are not written yet.
+                self._save_beside(path, _contents_of(path) if isinstance(f, (str, os.PathLike)) else None)
 
         @functools.wraps(load)
         def load_and_remember(f: Any, *args: Any, **kwargs: Any) -> Any:
@@ -90,6 +94,9 @@ class Checkpoints:
         refused = ""
         for path in self._found:
             content = _read(path)
+            if content.get("checkpoint") not in (None, _contents_of(path.with_name(path.name.removesuffix(SUFFIX)))):
+                refused = f"The gate starts afresh: {path} was saved beside another checkpoint of that name."
+                continue
             if content["gate"]["step"] == first - 1 and {name: content[name] for name in self._run} == self._run:
                 say(f"The gate takes its state from {path}.")
                 return content["gate"]
@@ -103,16 +110,17 @@ class Checkpoints:
             say(refused)
         return None
 
-    def _save_beside(self, checkpoint: Path) -> None:
+    def _save_beside(self, checkpoint: Path, contents: str | None) -> None:
         gate = self.gate
         try:
             if gate is None or not gate.config.enabled or gate.stats()["iterations"] == 0:
                 return
-            for state in checkpoint.parent.glob(f"*{SUFFIX}"):  # some scripts delete their older checkpoints
-                if state.is_file() and not state.with_name(state.name.removesuffix(SUFFIX)).exists():
-                    state.unlink(missing_ok=True)
+            for older in checkpoint.parent.glob(f"*{SUFFIX}"):  # some scripts delete their older checkpoints
+                if older.is_file() and not older.with_name(older.name.removesuffix(SUFFIX)).exists():
+                    older.unlink(missing_ok=True)
             with write_aside(_beside(checkpoint)) as temporary:
-                temporary.write_text(json.dumps({**self._run, "gate": gate.state_dict()}) + "\n")
+                state = {**self._run, "checkpoint": contents, "gate": gate.state_dict()}
+                temporary.write_text(json.dumps(state) + "\n")
         except Exception as error:  # the script has its checkpoint and can continue to train
             why = f"{type(error).__name__}: {error}"
             say(f"{_beside(checkpoint)} could not be written ({why}): if a run resumes here, its gate starts afresh.")
@@ -122,6 +130,17 @@ def _path_of(file: Any) -> Path | None:
     """Return the path of a file that a script saves or loads, by its path or as an open file; None if it has none."""
     name = file if isinstance(file, os.PathLike) else getattr(file, "name", file)
     return Path(name) if isinstance(name, (str, os.PathLike)) else None
+
+
+def _contents_of(checkpoint: Path) -> str | None:
+    """Return a text by which the contents of two checkpoints differ; None if the file cannot be read."""
+    try:
+        with open(checkpoint, "rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(size - TAIL, 0))
+            return f"{size} bytes, {zlib.crc32(file.read()):08x}"
+    except OSError:
+        return None
 
 
 def _beside(checkpoint: Path) -> Path:

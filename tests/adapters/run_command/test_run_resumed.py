@@ -132,3 +132,12 @@ def test_a_resumed_run_without_a_state_says_so(train, capfd):
     assert code == 0 and sentence in capfd.readouterr().err
     code, _ = train("share", "--start", str(off / "chkpnt40.pth"), gate=["--share", "0.5"])
     assert code == 0 and capfd.readouterr().err.count(sentence) == 1  # the loop's range asks, and its first iteration
+
+
+def test_a_state_beside_a_later_checkpoint_of_another_run_is_not_used(train, capfd):
+    _, folder = train("same", "--save")
+    train("same", "--save", gate=["--no-gate"])  # it replaces the checkpoints, and leaves the states
+    code, resumed = train("resumed", "--start", str(folder / "chkpnt40.pth"))
+    state = folder / "chkpnt40.pth.skipgs.json"
+    sentence = f"The gate starts afresh: {state} was saved beside another checkpoint of that name."
+    assert code == 0 and sentence in capfd.readouterr().err and counted(resumed)["iterations"] == 20
