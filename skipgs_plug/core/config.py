@@ -164,6 +164,17 @@ def _check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
         raise SkipGSError(f"{name} must be one of {', '.join(choices)}, not {value!r}.")
 
 
+def shares_as_given(growing: float | str | None, refining: float | str | None) -> str:
+    """Return the settings that ask for these shares of `SkipConfig.growing` and `SkipConfig.refining`, for messages."""
+    if refining is None:
+        return "no share"
+    if growing is None:
+        return f"refine_share={refining!r}"
+    if growing == refining:
+        return f"share={growing!r}"
+    return f"grow_share={growing!r} and refine_share={refining!r}"
+
+
 FIELDS = frozenset(field.name for field in dataclasses.fields(SkipConfig))
 
 

@@ -15,11 +15,12 @@ from skipgs_plug.core import decision, distributed
 from skipgs_plug.core.clock import GateClock
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.decision import Decision
-from skipgs_plug.core.errors import GateOrderError, GateStateError, SkipGSError
+from skipgs_plug.core.errors import GateOrderError, SkipGSError
 from skipgs_plug.core.gated_iteration import GatedIteration
 from skipgs_plug.core.loss_scaler import unscaled
 from skipgs_plug.core.nonfinite import NonFiniteGuard
 from skipgs_plug.core.pace.choose import pace_of
+from skipgs_plug.core.pace.phased import other_shares
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.policy import Policy
 from skipgs_plug.core.release import Release
@@ -363,11 +364,7 @@ class Engine:
         """Load the state of the pace and of visibility; the authors' controller has neither."""
         state = whole.get("pace")
         if (state is None) == self.pace.leaves_out:
-            saved = None if state is None else state["refining"]["asked"]
-            raise GateStateError(
-                f"The gate state was saved with refine_share={saved!r}, not {self.config.refining!r}; "
-                "continue with that setting, or start the gate afresh."
-            )
+            raise other_shares(state, self.config)
         if "visibility" in whole:
             self.rates.visibility.load_state_dict(whole["visibility"])
         if state is not None:

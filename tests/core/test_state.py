@@ -186,7 +186,7 @@ def test_losses_near_their_means_or_after_an_event_pass() -> None:
 def test_a_state_of_the_authors_controller_has_no_refinement() -> None:
     with (
         SkipGate(start_iter=0, refine_share=0.4) as gate,
-        pytest.raises(SkipGSError, match=r"refine_share=None, not 0\.4"),
+        pytest.raises(SkipGSError, match=r"with no share, not refine_share=0\.4"),
     ):
         gate.load_state_dict(RELEASE)
 

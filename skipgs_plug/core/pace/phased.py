@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from skipgs_plug.core.caution import caution
-from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.config import SkipConfig, shares_as_given
 from skipgs_plug.core.errors import GateStateError, SkipGSError
 from skipgs_plug.core.pace.base import Always, Known, Pace, Source, nothing_always, nothing_known
 from skipgs_plug.core.pace.growing import Growing
@@ -285,13 +285,8 @@ class Phased(Pace):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         growing = state["growing"]
-        asked = state.get("grow_asked", None if growing is None else growing["asked"])
-        if (state["refining"]["asked"], asked) != (self._config.refining, self._config.growing):
-            raise GateStateError(
-                f"The gate state was saved with refine_share={state['refining']['asked']!r} and "
-                f"grow_share={asked!r}, not {self._config.refining!r} and {self._config.growing!r}; continue with "
-                "those settings, or start the gate afresh."
-            )
+        if _asked_in(state) != (self._config.growing, self._config.refining):
+            raise other_shares(state, self._config)
         self._facts.required = set(state["required"])
         self.refining.load_state_dict(state["refining"])
         if growing is not None:
@@ -303,3 +298,18 @@ class Phased(Pace):
             self._configured = True
         if self._planned is not None:
             self._read(self._planned, max(self._facts.start, state["next"] or 0))
+
+
+def other_shares(state: dict[str, Any] | None, config: SkipConfig) -> GateStateError:
+    """Return the error about a state of other shares than the run asks for; None is the state of a run without one."""
+    saved = shares_as_given(None, None) if state is None else shares_as_given(*_asked_in(state))
+    return GateStateError(
+        f"The gate state was saved with {saved}, not {shares_as_given(config.growing, config.refining)}; continue with "
+        "that setting, or start the gate afresh."
+    )
+
+
+def _asked_in(state: dict[str, Any]) -> tuple[float | str | None, float | str | None]:
+    """Return the shares of both phases that the saved run asked for."""
+    growing = state["growing"]
+    return state.get("grow_asked", None if growing is None else growing["asked"]), state["refining"]["asked"]

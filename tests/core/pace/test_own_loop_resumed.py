@@ -1,5 +1,6 @@
 """`for step in gate.iterations(range(...))`: states of the gate, saved and loaded."""
 
+import itertools
 import json
 
 import pytest
@@ -86,6 +87,27 @@ def test_a_state_of_another_share_is_refused():
     with SkipGate(start_iter=10, refine_share=0.4, enabled=False) as gate:
         gate.load_state_dict(state)
         assert Loop(begin=50).train(gate).ran == [*range(50, 100)]
+
+
+def test_shares_are_named_as_they_were_given():
+    asked = {
+        "no share": {},
+        "share='auto'": {"share": "auto"},
+        "share=0.5": {"share": 0.5},
+        "refine_share=0.5": {"refine_share": 0.5},
+        "grow_share=0.5 and refine_share=0.4": {"grow_share": 0.5, "refine_share": 0.4},
+    }
+    states = {}
+    for text, settings in asked.items():
+        with SkipGate(start_iter=10, **settings) as gate:
+            for step in gate.iterations(range(40), views=["a"], events=[5]):
+                gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
+                if step == 20:
+                    states[text] = gate.state_dict()
+    for saved, other in itertools.permutations(asked, 2):
+        sentence = f"The gate state was saved with {saved}, not {other}; continue with that setting, or"
+        with SkipGate(start_iter=10, **asked[other]) as gate, pytest.raises(SkipGSError, match=sentence):
+            gate.load_state_dict(states[saved])
 
 
 def test_a_state_with_larger_steps_does_not_go_on_without():
