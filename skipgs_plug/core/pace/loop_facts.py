@@ -9,9 +9,9 @@ from typing import Any
 from torch import Tensor
 
 from skipgs_plug.core import distributed
-from skipgs_plug.core.errors import SkipGSError
+from skipgs_plug.core.errors import GateStateError, SkipGSError
 from skipgs_plug.core.pace.base import Always, Known, nothing_always, nothing_known
-from skipgs_plug.core.pace.loop_range import LoopRange
+from skipgs_plug.core.pace.loop_range import LoopRange, require_planned
 from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
 from skipgs_plug.core.source.lines import line_of
 from skipgs_plug.core.source.milestones import TrainingLoop
@@ -41,6 +41,7 @@ class LoopFacts:
         self.last: int | None = None
         self.densification: Densification | None = None
         self.required: set[int] = set()
+        self._saved: dict[str, Any] | None = None  # state that was loaded, until the trainer tells its facts
         self.grown: dict[str, set[int]] = {}
         self.refined: dict[str, set[int]] = {}
         self.bars = Bars([])
@@ -56,13 +57,30 @@ class LoopFacts:
         self._epoch: int | None = None  # iterations that show every view once; None if that is the number of views
 
     def configure(self, start: int, info: TrainerInfo, views: list[str] | None) -> None:
-        """Receive the facts about the trainer; see `Pace.configure`."""
+        """Receive the facts about the trainer; see `Pace.configure`.
+
+        Raises:
+            GateStateError: Those that the iterations were planned with until now are of a run with another schedule.
+        """
+        if self._saved is not None:
+            require_same_schedule(self._saved, start, info.max_steps)
+        self._saved = None
         self.start, self.last, self._views = start, info.max_steps, views
         self._accumulates, self._steps_each, self._epoch = info.accumulates, info.steps_each, info.epoch
         self.densification = info.densification or self.densification
         self._photographs, self._slow_positions = info.photographs, info.slow_positions
         self._random_points = info.random_points
         self._positions_rate = self._positions_rate or info.positions_rate  # a resumed run begins with another one
+
+    def require_planned(self, numbers: range) -> None:
+        """Raise SkipGSError if a loop continues after the last iteration that is known, at which steps are 0.
+
+        The trainer tells it, or the first loop of refinement, or the state of a checkpoint.
+        """
+        if self.last is not None and numbers and numbers[-1] > self.last:
+            if self._saved is not None:
+                require_same_schedule(self._saved, self.start, numbers[-1])
+            require_planned(numbers, self.last)
 
     def describe(self, always: Always, pure: Iterable[str], densification: Densification | None, known: Known) -> None:
         """Receive facts from the trainer's adapter; see `Pace.describe`."""
@@ -150,10 +168,39 @@ class LoopFacts:
             "positions_rate": self._positions_rate,
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict()`."""
+    def load_state_dict(self, state: dict[str, Any], configured: bool) -> None:
+        """Continue from `state_dict()`; if the trainer has told its facts, only check when its densification ends.
+
+        Raises:
+            GateStateError: It ends elsewhere.
+        """
+        if configured:
+            require_same_schedule(state, self.start, None)
+            return
+        self._saved = state
         self.start, self.last, self._accumulates = state["start"], state["last"], state["keeps_rates"]
         self._steps_each = state.get("steps_each", False)
         self._views, self._epoch = state.get("views"), state.get("epoch")
         self._slow_positions = state.get("slow_positions", False)
         self._positions_rate = state.get("positions_rate", 0.0)
+
+
+def require_same_schedule(state: Mapping[str, Any], start: int, last: int | None) -> None:
+    """Require that a state was saved in a run with this first iteration of refinement, and this last iteration.
+
+    The saved plan counts the iterations of both phases, and its steps shrink until the last one. Once refinement has
+    begun, a trainer may say that it begins where the run goes on, as a script that only refines does.
+
+    Raises:
+        GateStateError: It was not.
+    """
+    told = ""
+    if start != state["start"] > (state.get("next") or 0):
+        told = f"whose refinement begins at iteration {state['start']:,}, not {start:,}"
+    elif None not in (last, state["last"]) and last != state["last"]:
+        told = f"that ends with iteration {state['last']:,}, not {last:,}"
+    if told:
+        raise GateStateError(
+            f"The gate state was saved in a run {told}; continue with the schedule of that run, or start the gate "
+            "afresh."
+        )

@@ -12,7 +12,7 @@ from skipgs_plug.core.pace.base import Always, Known, Pace, Source, nothing_alwa
 from skipgs_plug.core.pace.growing import Growing
 from skipgs_plug.core.pace.loop_facts import LoopFacts
 from skipgs_plug.core.pace.loop_finder import LoopFinder
-from skipgs_plug.core.pace.loop_range import LoopRange, require_planned
+from skipgs_plug.core.pace.loop_range import LoopRange
 from skipgs_plug.core.pace.phase import Phase
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.pace.refinement_policy import RefinementPolicy
@@ -91,7 +91,7 @@ class Phased(Pace):
         densification: Densification | None = None,
     ) -> LoopRange:
         self._facts.choose(always, views, densification)
-        self._require_planned(numbers)
+        self._facts.require_planned(numbers)
         self._finder.found = LoopRange(numbers, self, source)
         return self._finder.found
 
@@ -213,7 +213,7 @@ class Phased(Pace):
         Loops that follow each other are read one after the other, and each plan takes the place of the one before.
         """
         facts = self._facts
-        self._require_planned(loop.numbers)
+        self._facts.require_planned(loop.numbers)
         # On resume, include iterations that are done already, because conditions are judged by how often they hold.
         # A trainer that is trained in parts, such as train(until=1000), has more numbers than its first loop.
         end = loop.numbers.stop if facts.last is None else max(loop.numbers.stop, facts.last + 1)
@@ -239,10 +239,6 @@ class Phased(Pace):
             facts.last = last  # settled, because steps shrink until then
             self.refining.begin(facts.plan(refined, facts.refined, last, self.growing))
         self._planned = loop
-
-    def _require_planned(self, numbers: range) -> None:
-        if self._facts.last is not None:  # told by the adapter, or by the first loop of refinement
-            require_planned(numbers, self._facts.last)
 
     def _require_events(self) -> None:
         """Refuse `grow_share` if the densification events are not known. With `share`, densification runs whole then.
@@ -293,9 +289,8 @@ class Phased(Pace):
             self.growing.load_state_dict(growing)
         self._finder.expected = state["next"]
         # The loop asks about its first number before the trainer reports its facts.
-        if not self._configured:
-            self._facts.load_state_dict(state)
-            self._configured = True
+        self._facts.load_state_dict(state, self._configured)
+        self._configured = True
         if self._planned is not None:
             self._read(self._planned, max(self._facts.start, state["next"] or 0))
 

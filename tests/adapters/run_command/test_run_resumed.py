@@ -141,3 +141,24 @@ def test_a_state_beside_a_later_checkpoint_of_another_run_is_not_used(train, cap
     state = folder / "chkpnt40.pth.skipgs.json"
     sentence = f"The gate starts afresh: {state} was saved beside another checkpoint of that name."
     assert code == 0 and sentence in capfd.readouterr().err and counted(resumed)["iterations"] == 20
+
+
+@pytest.mark.parametrize(
+    ("option", "other", "sentence"),
+    [
+        ("iterations=60", "iterations=90", "that ends with iteration 60, not 90"),
+        ("densify_until_iter=20", "densify_until_iter=30", "whose refinement begins at iteration 20, not 30"),
+    ],
+)
+def test_a_run_that_goes_on_with_another_schedule_is_refused(checkout, train, capfd, option, other, sentence):
+    share = ["--refine-share", "0.5"]
+    _, folder = train("whole", "--save", gate=share)
+    script = Path(checkout)
+    script.write_text(script.read_text().replace(option, other))
+    start = ["--start", str(folder / "chkpnt10.pth")]
+    code, refused = train("refused", *start, gate=share)
+    assert code == cli.BAD_INPUT and not (refused / "model.pth").exists()
+    how = "continue with the schedule of that run, or start the gate afresh with --resume-gate off."
+    assert f"The gate state was saved in a run {sentence}; {how}" in capfd.readouterr().err
+    code, afresh = train("afresh", *start, gate=[*share, "--resume-gate", "off"])
+    assert code == 0 and (afresh / "model.pth").exists()

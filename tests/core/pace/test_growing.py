@@ -209,7 +209,7 @@ def test_a_run_whose_densification_runs_whole_is_resumed():
             other = Loop(one.ran[-1] + 1, one.means.detach(), one.optimizer.state_dict()).train(second, events=None)
         assert one.ran + other.ran == whole.ran
         assert torch.equal(other.means, whole.means)
-    with SkipGate(start_iter=START, share=0.5) as other, pytest.raises(SkipGSError, match=r"grow_share=0\.25, not"):
+    with SkipGate(start_iter=START, share=0.5) as other, pytest.raises(SkipGSError, match=r"share=0\.25, not"):
         other.load_state_dict(state)
 
 

@@ -18,7 +18,7 @@ def test_a_resumed_run_plans_by_the_facts_of_the_first_one() -> None:
     """A trainer tells its facts after its loop has begun, and a resumed loop is planned before that."""
     facts, resumed = LoopFacts(None), LoopFacts(None)
     facts.configure(500, FACTS, ["a", "b", "c"])
-    resumed.load_state_dict(json.loads(json.dumps(facts.state_dict())))
+    resumed.load_state_dict(json.loads(json.dumps(facts.state_dict())), configured=False)
     told, known = (one.plan(range(500, 1001), {}, 1000, Phase()) for one in (facts, resumed))
     assert known._replace(before=told.before) == told
     assert (known.views, known.epoch, known.slow_positions) == (["a", "b", "c"], 6, True)

@@ -110,6 +110,16 @@ def test_shares_are_named_as_they_were_given():
             gate.load_state_dict(states[saved])
 
 
+def test_a_state_of_another_schedule_is_refused():
+    with SkipGate(start_iter=10, refine_share=0.4) as gate:
+        states = [*first_part(Loop(), gate, 15, {})]
+    sentence = "whose refinement begins at iteration 10, not 20; continue with the schedule of that run"
+    with SkipGate(start_iter=20, refine_share=0.4) as gate, pytest.raises(SkipGSError, match=sentence):
+        gate.load_state_dict(states[5])
+    with SkipGate(start_iter=12, refine_share=0.4) as gate:
+        gate.load_state_dict(states[-1])  # refinement has begun
+
+
 def test_a_state_with_larger_steps_does_not_go_on_without():
     with SkipGate(start_iter=10, refine_share=0.4) as gate:
         for step in gate.iterations(range(100), always=()):
