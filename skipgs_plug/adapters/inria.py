@@ -103,7 +103,8 @@ class InriaFamily(MarkedScript):
         """
         self._code, self._model_class = code, model
         self._unknown = unrecognised(code, renderers, model, self._known_calls(), self.arguments)
-        self._unknown.refuse(self.difference(code))
+        if code.syntax is None:
+            self._unknown.refuse(self.difference(code), None)
         self._unknown.tell(self.difference(code), self.renders[0])
 
     def difference(self, code: LoopCode) -> str:
@@ -325,6 +326,7 @@ class InriaFamily(MarkedScript):
         adds = changing(self._unknown.calls).union(self.changes) & found.ends.keys()
         self._densifies = UNTIL in found.asked or UNTIL not in found.passed_over or bool(adds)
         opt, who = loop[OPTIONS], self.difference(self._code)
+        self._unknown.refuse(who, found)
         refuse_loop_without_end(found.ends, self.start_iter(opt, loop), opt.iterations, who)
         return {name: end for name, end in found.ends.items() if end is not None and name in awaited - {*self.pausing}}
 

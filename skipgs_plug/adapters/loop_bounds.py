@@ -103,6 +103,14 @@ class CallReader:
         self._only_gradients = False  # inside a function of `stops`
         self._checked: set[ast.expr] = set()  # gradients that functions compare with None
 
+    def reaches(self, name: str) -> bool:
+        """Whether the loop may call a method of this name, or assign to `data`, in some iteration.
+
+        A method that the reader has not met may be called by code that it could not follow.
+        """
+        called = ASSIGNED if name == "data" else name
+        return called in self.ends or name not in self.passed_over
+
     def read(self, function: Any, numbers: Collection[str], values: Mapping[str, Any], end: int | None = None) -> None:
         """Read a function or a bound method.
 

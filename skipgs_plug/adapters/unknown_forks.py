@@ -73,17 +73,19 @@ class Unrecognised(NamedTuple):
     writes: frozenset[str]
     known: frozenset[str]
 
-    def refuse(self, who: str) -> None:
+    def refuse(self, who: str, found: CallReader | None) -> None:
         """Raise an error if the loop itself changes tensors. Noise alone is accepted: it may be the input of a network.
 
         Args:
             who: Start of the message.
+            found: What was found in the loop; None if it has no source. Then any such method in it counts.
 
         Raises:
-            AdapterMismatchError: The loop changes tensors in place.
+            AdapterMismatchError: The loop changes tensors in place, and no option keeps it from that.
         """
-        if self.writes:
-            names = ", ".join(sorted(self.writes | self.noise))
+        writes = {name for name in self.writes if found is None or found.reaches(name)}
+        if writes:
+            names = ", ".join(sorted(writes | self.noise))
             raise AdapterMismatchError(
                 f"{who}: its loop itself changes values ({names}), and would still do so in skipped iterations. "
                 f"{BY_HAND}"

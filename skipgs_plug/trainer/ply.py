@@ -38,6 +38,7 @@ PROPERTIES = (
     *(f"f_rest_{i}" for i in range(3 * HIGHER_COEFFICIENTS)),
     *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
+WIDTHS = (3, 3, 3 * HIGHER_COEFFICIENTS, 1, 3)  # numbers of properties after the position: normal, SH, opacity, scale
 
 
 def sh_degree(coefficients: int) -> int:
@@ -54,23 +55,18 @@ def write_ply(splats: Mapping[str, Tensor], path: str | Path) -> None:
 
     values = saturated({name: tensor.detach().cpu().float() for name, tensor in splats.items()}, path)
     positions = splats["means"].detach().cpu()  # float64 where float32 would lose some
-    n = len(values["means"])
-    higher = torch.zeros(n, HIGHER_COEFFICIENTS, 3, dtype=torch.float32)
-    higher[:, : values["shN"].shape[1]] = values["shN"]
-    columns = [
-        values["means"],
-        torch.zeros(n, 3, dtype=torch.float32),
-        values["sh0"].reshape(n, 3),
-        higher.transpose(1, 2).reshape(n, 3 * HIGHER_COEFFICIENTS),
-        values["opacities"].reshape(n, 1),
-        values["scales"],
-        values["quats"],
-    ]
-    table = torch.cat(columns, dim=1).numpy()
-    kind = "<f8" if positions.dtype == torch.float64 else "<f4"
-    vertices = np.empty(n, dtype=[(name, kind if name in ("x", "y", "z") else "<f4") for name in PROPERTIES])
-    for i, name in enumerate(PROPERTIES):
-        vertices[name] = positions[:, i].numpy() if i < 3 else table[:, i]
+    n, kind, others = len(positions), "<f8" if positions.dtype == torch.float64 else "<f4", PROPERTIES[3:]
+    # Each value is written once: every further array as large as the file costs time for its pages.
+    rows = np.zeros(n, dtype=[("positions", kind, 3), ("others", "<f4", len(others))])
+    rows["positions"] = positions.numpy()
+    _, colour, higher, opacity, scales, quats = np.split(rows["others"], np.cumsum(WIDTHS), axis=1)
+    colour[:] = values["sh0"].reshape(n, 3).numpy()
+    by_channel = higher.reshape(n, 3, HIGHER_COEFFICIENTS)
+    by_channel[:, :, : values["shN"].shape[1]] = values["shN"].transpose(1, 2).numpy()
+    opacity[:] = values["opacities"].reshape(n, 1).numpy()
+    scales[:] = values["scales"].numpy()
+    quats[:] = values["quats"].numpy()
+    vertices = rows.view([*((name, kind) for name in PROPERTIES[:3]), *((name, "<f4") for name in others)])
     with write_aside(path) as temporary:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(temporary))
 

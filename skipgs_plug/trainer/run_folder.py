@@ -114,5 +114,6 @@ def write_pair(path: Path, photograph: Tensor, render: Tensor) -> None:
     from PIL import Image
 
     shown = (render.clamp(0, 1) * 255).round().byte()
+    pair = Image.fromarray(np.concatenate([photograph.numpy(), shown.numpy()], axis=1))
     with write_aside(path) as temporary:
-        Image.fromarray(np.concatenate([photograph.numpy(), shown.numpy()], axis=1)).save(temporary, format="PNG")
+        pair.save(temporary, format="PNG", compress_level=1)  # a third of the time, for 5 % more bytes

@@ -75,4 +75,4 @@ def write_pictures(folder: Path, frames: Iterable[np.ndarray], names: Iterable[s
         raise InputError(f"{folder} exists and is not an empty folder; give another OUT, or a name that ends in .mp4.")
     for frame, name in zip(frames, names, strict=True):
         with write_aside(folder / f"{name}.png") as temporary:
-            Image.fromarray(frame).save(temporary, format="PNG")
+            Image.fromarray(frame).save(temporary, format="PNG", compress_level=1)

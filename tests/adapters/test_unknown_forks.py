@@ -131,6 +131,17 @@ def test_loop_that_changes_values_itself_is_refused(extra, sentence):
     assert torch.Tensor.backward.__module__ == "torch._tensor"
 
 
+@pytest.mark.parametrize("write", ["gaussians.values['xyz'].add_(0.1)", "gaussians.values['xyz'].data += 0.1"])
+def test_loop_that_changes_values_behind_an_option_is_refused_only_if_it_is_on(from_file, write):
+    module = from_file(extra=f"if opt.shakes: {write}")
+    with SkipGate(module, policy=SkipAlways()) as gate:
+        train(module, shakes=False)
+    assert gate.report()["backwards_skipped"] == 21
+    with SkipGate(module), pytest.raises(AdapterMismatchError, match="itself changes values"):
+        train(module, shakes=True)
+    assert log.backwards == []
+
+
 def test_loop_without_an_end_of_densification_is_refused():
     with pytest.raises(AdapterMismatchError, match="its loop never asks for densify_until_iter"):
         SkipGate(unknown_fork(densification="pass"))

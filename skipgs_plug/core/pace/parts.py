@@ -42,9 +42,9 @@ def group_part(group: dict[str, Any], name: str | None = None) -> float | None:
 
     The image is linear in the colours. Trainers set the rate of the higher bands to a twentieth of the constant band's,
     so the higher bands tolerate the longest steps. All views agree on the constant band, so it needs shorter steps.
-    Positions, whose rate has fallen to a tenth when refinement begins, and scales tolerate longer steps. Opacities are
-    not raised in refinement, except to recover from a reset: their rate is large already, and longer steps make them
-    flicker.
+    Without higher bands (SH degree 0) it takes the common factor; see `Division`. Positions, whose rate has fallen to a
+    tenth when refinement begins, and scales tolerate longer steps. Opacities are not raised in refinement, except to
+    recover from a reset: their rate is large already, and longer steps make them flicker.
 
     A group without any name is identified by its shape: [N, 1, 3] is the constant band, [N, K, 3] are higher bands,
     [N, 1] are opacities.
@@ -86,6 +86,7 @@ class GroupInfo:
         positions: Parameters that may be positions [N, 3].
         named_positions: Whether the name says that they are positions.
         named_scales: Whether the name says that they are scales.
+        no_bands: Whether it is the group of higher bands in a model that has none: [N, 0, 3].
         betas: The trainer's betas when `shorter` was called last.
         short: The betas that `shorter` returned then.
     """
@@ -99,6 +100,7 @@ class GroupInfo:
         "group",
         "named_positions",
         "named_scales",
+        "no_bands",
         "part",
         "positions",
         "short",
@@ -117,6 +119,7 @@ class GroupInfo:
         self._shaped = all(shape in GAUSSIAN_SHAPES or (len(shape) == 2 and shape[1] == 3) for shape in shapes)
         self.named_positions = known in POSITIONS
         self.named_scales = known in SCALES
+        self.no_bands = bool(shapes) and all(shape == (0, 3) for shape in shapes)
         may_be = self._params if known is None or known in POSITIONS else []
         self.positions = [param for param in may_be if param.ndim == 2 and param.shape[1] == 3]
         self.betas: Any = None
@@ -232,6 +235,7 @@ class Division(NamedTuple):
         raised: Whether the factor is larger than 1 while the scene grows. True in refinement.
         opacity_rate: Least learning rate of opacities, if they must recover from their last reset; else 0.
         positions_rate: Largest learning rate of positions in refinement.
+        constant_alone: Whether the colours have a constant band only.
     """
 
     rows: int
@@ -239,6 +243,7 @@ class Division(NamedTuple):
     raised: bool
     opacity_rate: float = 0.0
     positions_rate: float = math.inf
+    constant_alone: bool = False
 
 
 class OptimizerInfo:
@@ -254,11 +259,22 @@ class OptimizerInfo:
         positions: Parameters that may be positions [N, 3].
         known_positions: Positions [N, 3], if a name says so, which tell the number of Gaussians; else None.
         opacities: The only parameter of a group of opacities; else None.
+        no_bands: Whether a group tells that the colours have a constant band only.
         scaled: The groups that are scaled; see `divide`.
         division: The argument of `divide` that `scaled` was found for.
     """
 
-    __slots__ = ("_only", "division", "groups", "known_positions", "name", "opacities", "positions", "scaled")
+    __slots__ = (
+        "_only",
+        "division",
+        "groups",
+        "known_positions",
+        "name",
+        "no_bands",
+        "opacities",
+        "positions",
+        "scaled",
+    )
 
     def __init__(self, optimizer: torch.optim.Optimizer, name: str | None) -> None:
         self.name = name
@@ -267,6 +283,7 @@ class OptimizerInfo:
         named = [param for group in self.groups if group.named_positions for param in group.positions]
         self.known_positions = named[0] if len(named) == 1 else None
         self.opacities = next((info.first for info in self.groups if info.part is None), None)
+        self.no_bands = any(group.no_bands for group in self.groups)
         self.scaled: list[ScaledGroup] = []
         self.division: Division | None = None
         self._only = self.groups[0] if len(self.groups) == 1 and self.groups[0].first is not None else None
@@ -286,7 +303,7 @@ class OptimizerInfo:
 
 
 def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
-    rows, growing, raised, opacity_rate, positions_rate = division
+    rows, growing, raised, opacity_rate, positions_rate, constant_alone = division
     if not info.of_gaussians(rows):
         return ScaledGroup(info.group, OTHERS_AT_MOST, 1.0, None) if growing is None else None
     longer = None if growing is not None and growing.remembers(info) else info
@@ -301,6 +318,8 @@ def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
     part = info.part if growing is None else growing.of(info)
     if part == 0.0:
         return None
+    if part == CONSTANT_BAND and constant_alone:
+        part = OTHERS
     highest = positions_rate if growing is None and info.named_positions else math.inf
     return ScaledGroup(info.group, part, math.inf, longer, highest)
 

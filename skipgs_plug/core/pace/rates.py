@@ -85,6 +85,7 @@ class ScaledRates:
         self.on_error: Callable[[Exception], None] | None = None
         self._factor: float | None = None
         self.opacity_rate, self.positions_rate = 0.0, math.inf
+        self._constant_alone = False  # whether a group told that the colours have a constant band only
         self._division = Division(0, None, True)
         self._rows = self._rows_now = 0  # number of Gaussians in the previous and in this iteration; 0 if unknown
         self._thread = get_ident()
@@ -192,6 +193,7 @@ class ScaledRates:
             info = step.info
             if not info.fits(optimizer):
                 info = step.info = OptimizerInfo(optimizer, info.name)
+            self._constant_alone |= info.no_bands
             if info.positions:
                 self._count(info)
             if info.opacities is not None and self._division.growing is not None:
@@ -221,7 +223,7 @@ class ScaledRates:
 
     def _divide(self, rows: int, growing: GrowingParts | None, raised: bool) -> None:
         """Set the division; an equal one stays the same object, so that optimizers compare it fast."""
-        division = (rows, growing, raised, self.opacity_rate, self.positions_rate)
+        division = (rows, growing, raised, self.opacity_rate, self.positions_rate, self._constant_alone)
         if division != self._division:
             self._division = Division(*division)
 

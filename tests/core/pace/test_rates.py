@@ -54,6 +54,28 @@ def stepped(scaled, factor, optimizers):
     return moved
 
 
+def colours(*higher, together):
+    """Optimizers of positions, of the constant band and of higher bands of these shapes, or one of all three."""
+    shapes = {"means": (6, 3), "sh0": (6, 1, 3), "shN": higher}
+    groups = [{"params": [torch.nn.Parameter(torch.ones(shape))], "name": name} for name, shape in shapes.items()]
+    return [torch.optim.SGD(groups, lr=0.1)] if together else [torch.optim.SGD([group], lr=0.1) for group in groups]
+
+
+@pytest.mark.parametrize("together", [True, False])
+@pytest.mark.parametrize(("higher", "times"), [((6, 0, 3), 4.0), ((6, 15, 3), 2.0)])
+def test_a_constant_band_without_higher_ones_takes_the_common_factor(rates, higher, times, together):
+    optimizers = colours(*higher, together=together)
+    sh0 = next(group for one in optimizers for group in one.param_groups if group["name"] == "sh0")["params"][0]
+    for _ in range(2):  # an optimizer of its own for the higher bands steps after that of the constant one
+        rates.scale(4.0)
+        before = sh0.detach().clone()
+        for optimizer in optimizers:
+            for group in optimizer.param_groups:
+                group["params"][0].grad = torch.ones_like(group["params"][0])
+            optimizer.step()
+    assert torch.allclose(before - sh0.detach(), torch.tensor(0.1 * times))
+
+
 @pytest.mark.parametrize(
     "shape", [(7, 3, 4), (7, 9), (64, 32), (5,)], ids=["exposures", "poses", "a layer", "its bias"]
 )
