@@ -116,19 +116,23 @@ class Session:
         return stats
 
     def _finish(self) -> None:
-        """Evaluate, and write all files of a finished run, including files that an earlier session could not write."""
-        folder, trainer = self._folder, self._trainer
+        """Evaluate, write all files of a finished run, also those that an earlier session could not write, and report.
+
+        The report comes last: a reader who is gone ends the command there.
+        """
+        folder, trainer, said = self._folder, self._trainer, []
         with keep_going(self._failed), folder.renders(trainer, self._split) as keep:
             stats = self._evaluate(self._failed, keep)
         with keep_going(self._failed):
             self._curve.write(folder.root / "stats" / "train_curve.json")
         with keep_going(self._failed):
-            print(folder.write_ply(trainer))
+            said.append(str(folder.write_ply(trainer)))
         if self._gate is not None:
             with keep_going(self._failed):
                 write_report(self._gate, folder.root / "skipgs.json", frame=trainer.scene.frame.as_dict())
-            print(self._gate.summary())
-        print(f"{self._described(stats)}; T_total {trainer.t_total:.1f} s, T_post {trainer.t_post:.1f} s")
+            said.append(self._gate.summary())
+        said.append(f"{self._described(stats)}; T_total {trainer.t_total:.1f} s, T_post {trainer.t_post:.1f} s")
+        print("\n".join(said))
 
     def _described(self, stats: dict[str, Any]) -> str:
         net = self._options.lpips_net
