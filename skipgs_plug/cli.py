@@ -139,6 +139,10 @@ def run(arguments: list[str], whole_program: bool) -> int:
     if name in COMMANDS:
         # Options are read before heavy packages are imported, so --help and mistakes are answered at once.
         args = importlib.import_module(f"skipgs_plug.commands.options.{name}").parse(rest)
+        try:
+            os.getcwd()
+        except FileNotFoundError:  # MKL, which torch loads, would end the process
+            return fail("The current folder has been removed; change to another one.")
         with uncollected() if whole_program else contextlib.nullcontext():
             command = importlib.import_module(f"skipgs_plug.commands.{name}")
             if whole_program:
