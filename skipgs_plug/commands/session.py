@@ -71,8 +71,8 @@ class Session:
             lost = f"{files} of {self._folder.root} could not be written"
             if not self._folder.checkpoints():
                 raise InputError(
-                    f"{lost}, and there is no checkpoint to continue from; make room, and give the same command again, "
-                    "without --resume: it trains from the start."
+                    f"{lost}, and there is no checkpoint to continue from; make room, and train from the start with "
+                    "another --out, without --resume."
                 )
             raise InputError(f"{lost}; make room, and the same command with --resume writes them.")
         if stop.exit_code:
