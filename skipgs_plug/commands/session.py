@@ -136,7 +136,8 @@ class Session:
 
     def _described(self, stats: dict[str, Any]) -> str:
         net = self._options.lpips_net
-        where = f"{stats['views']} held-out views" if self._split == "val" else "TRAINING views (none held out)"
+        held_out = f"{stats['views']} held-out view{'' if stats['views'] == 1 else 's'}"
+        where = held_out if self._split == "val" else "TRAINING views (none held out)"
         lpips = f", LPIPS ({net}) {stats[f'lpips_{net}']:.4f}" if net else ""
         fitted = f" ({stats['cc_psnr']:.2f} with colours fitted to each)" if "cc_psnr" in stats else ""
         return (
