@@ -36,12 +36,16 @@ class RunFolder:
         self.root = Path(root).expanduser()
 
     def write_config(self, trainer: Trainer, gate: dict[str, Any] | None) -> None:
-        """Write cfg.yml: the settings, the near plane in units of the dataset, the frame, and the gate's settings."""
+        """Write cfg.yml: the settings, those that others decide too, the frame, and the gate's settings.
+
+        The near plane is in units of the dataset.
+        """
         import yaml
 
         frame = trainer.scene.frame
         content = {
             **dataclasses.asdict(trainer.config),
+            "schedule_steps": trainer.config.schedule,
             "near_plane": frame.dataset_length(trainer.near_plane),
             "frame": frame.as_dict(),
             "gate": gate,

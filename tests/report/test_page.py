@@ -131,6 +131,7 @@ def test_settings_that_differ_stand_beside_the_comparison(ungated_folder, script
     other = tmp_path / "other"
     shutil.copytree(ungated_folder, other)
     settings = (other / "cfg.yml").read_text()
+    assert "\nschedule_steps: 40\n" in settings  # as after a resume, which makes no difference
     (other / "cfg.yml").write_text(settings.replace("data_factor: 1", "data_factor: 4") + "newer: 1\n")
     page = make_page(tmp_path, ungated_folder, other, script_folder).read_text()
     assert rows_of(page, "Settings that differ") == [["data_factor", "1", "4", "-"]]
