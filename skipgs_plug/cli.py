@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import errno
 import importlib
-import io
 import os
 import sys
 import traceback
@@ -15,6 +14,7 @@ from typing import Annotated, Any, NamedTuple, Union
 
 from skipgs_plug.garbage import keep_everything, uncollected
 from skipgs_plug.messages import plain_warnings, say
+from skipgs_plug.output import drop_what_does_not_fit, flush, print_any_name, replace_closed_streams
 from skipgs_plug.terminate import UNREAD, Terminated, terminable
 
 
@@ -52,26 +52,44 @@ def main(argv: Sequence[str] | None = None) -> int:
     Standard streams that are closed are replaced by the null device, also after it has returned.
 
     Returns:
-        0: done. 2: bad input, with one sentence on stderr, or with the traceback under `--debug`. 130: interrupted.
-        143: terminated. 141: nobody reads the output.
+        0: done. 2: bad input, with one sentence on stderr, or with the traceback under `--debug`; or output that was
+        dropped, because its disk is full. 130: interrupted. 143: terminated. 141: nobody reads the output.
     """
     if argv is None and sys.argv[1:2] != ["run"]:  # a script of another project runs as without this package
         speak_utf8()
     replace_closed_streams()
     print_any_name()
     arguments = list(sys.argv[1:] if argv is None else argv)
+    # A script of another project keeps the garbage collector and the streams as they are, and so does a caller in
+    # Python.
+    if argv is not None or arguments[:1] == ["run"]:
+        return answer(arguments, whole_program=False)
+    outputs = drop_what_does_not_fit()
+    try:
+        code = answer(arguments, whole_program=True)
+    except SystemExit as ended:  # tyro, after --help or a mistake
+        code = int(ended.code or 0)
+    lost = next((output.lost for output in outputs if output.lost), None)
+    if lost and not code:
+        return fail(f"Part of the output could not be written ({lost}), but all else is done; send it elsewhere.")
+    return code
+
+
+def answer(arguments: list[str], whole_program: bool) -> int:
+    """Run one command, and turn an error into a sentence and an exit code."""
     own = arguments[: arguments.index("--")] if "--" in arguments else arguments
     own = [expand_home(argument) for argument in own]
     arguments[: len(own)] = own
     debug = "--debug" in own
     if debug:
         arguments.remove("--debug")
-    # A script of another project keeps the garbage collector as it is, and so does a caller in Python.
-    whole_program = argv is None and arguments[:1] != ["run"]
     try:
         # A script of another project gets signals as without this package.
         with contextlib.nullcontext() if arguments[:1] == ["run"] else terminable(), plain_warnings(WARNINGS):
-            return run(arguments, whole_program)
+            code = run(arguments, whole_program)
+            if whole_program:
+                flush()
+            return code
     except KeyboardInterrupt as error:
         return interrupted([error])
     except BrokenPipeError:
@@ -107,23 +125,6 @@ def expand_home(argument: str) -> str:
     return f"{option}{equals}{os.path.expanduser(value)}" if value.startswith("~") else argument
 
 
-def replace_closed_streams() -> None:
-    """Replace standard streams that were closed (`>&-`, some schedulers) by the null device.
-
-    Otherwise the next opened file would get the number of a closed stream, and output of a library would land in it.
-    """
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 - open until the process ends
-
-
-def print_any_name() -> None:
-    """Print characters that the locale lacks as escapes, instead of raising an error."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
-
-
 def run(arguments: list[str], whole_program: bool) -> int:
     """Find the command and call it, or list the commands."""
     name, *rest = arguments or [""]
@@ -138,6 +139,10 @@ def run(arguments: list[str], whole_program: bool) -> int:
     if name in COMMANDS:
         # Options are read before heavy packages are imported, so --help and mistakes are answered at once.
         args = importlib.import_module(f"skipgs_plug.commands.options.{name}").parse(rest)
+        try:
+            os.getcwd()
+        except FileNotFoundError:  # MKL, which torch loads, would end the process
+            return fail("The current folder has been removed; change to another one.")
         with uncollected() if whole_program else contextlib.nullcontext():
             command = importlib.import_module(f"skipgs_plug.commands.{name}")
             if whole_program:

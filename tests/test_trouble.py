@@ -200,6 +200,17 @@ def test_kernels_run_where_standard_streams_are_closed() -> None:
     assert tried.returncode == 0
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows keeps the current folder of a process")
+def test_a_current_folder_that_was_removed_is_named(tmp_path: Path) -> None:
+    (tmp_path / "gone").mkdir()
+    python = shlex.join([sys.executable, "-m", "skipgs_plug", "train", str(tmp_path), "--out", str(tmp_path / "run")])
+    code = f"cd {shlex.quote(str(tmp_path / 'gone'))} && rmdir ../gone && {python}"
+    path = {"PYTHONPATH": str(Path(cli.__file__).parent.parent)}
+    tried = subprocess.run(code, shell=True, capture_output=True, text=True, check=False, env={**os.environ, **path})
+    assert tried.returncode == 2
+    assert tried.stderr.endswith("skipgs-plug: The current folder has been removed; change to another one.\n")
+
+
 def test_a_file_that_cannot_be_written_says_how_much_it_needs(tmp_path: Path) -> None:
     import resource
 

@@ -12,14 +12,14 @@ class GateSettings:
     """Part of a trainer's checkpoints. Refuses to resume a checkpoint that was made with other settings.
 
     Args:
-        gate: The gate of the run; None if it has no gate.
+        gate: The gate of the run; None if it has no gate, or has none yet.
     """
 
     def __init__(self, gate: SkipGate | None) -> None:
-        self._settings = None if gate is None else gate.config.as_dict()
+        self.gate = gate
 
     def state_dict(self) -> dict[str, Any]:
-        return {"settings": self._settings}
+        return {"settings": None if self.gate is None else self.gate.config.as_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Compare the settings with those of this run.
@@ -27,8 +27,8 @@ class GateSettings:
         Raises:
             InputError: The checkpoint was made with other settings. The message names the first difference.
         """
-        before = state["settings"]
-        if (before is None) != (self._settings is None):
+        before, now = state["settings"], self.state_dict()["settings"]
+        if (before is None) != (now is None):
             raise InputError(
                 "The run was begun without a gate; resume it without --gate and without gate settings."
                 if before is None
@@ -36,7 +36,7 @@ class GateSettings:
             )
         # A run that is older than a setting ran with its default.
         before = SkipConfig().as_dict() | (before or {})
-        for name, value in (self._settings or {}).items():
+        for name, value in (now or {}).items():
             if before[name] != value:
                 raise InputError(
                     f"The run was begun with gate.{name}={before[name]!r}, not {value!r}; resume it with that setting."

@@ -28,6 +28,9 @@ def run(args: Args) -> int:
             raise InputError(f"--{name} {getattr(args, name)} is too small; give at least 1.")
     if args.fps > FASTEST:
         raise InputError(f"--fps {args.fps} is too large; give at most {FASTEST:,}.")
+    out = args.out.expanduser()
+    if out.suffix.lower() not in ("", ".mp4"):
+        raise InputError(f"{out} is neither a film (.mp4) nor a folder; give one of the two.")
     model = open_model(args.model, args.scene, args.data_factor)
     if model.scene is None:
         raise InputError(f"{args.model} names no cameras to render from; add --scene with the scene it shows.")
@@ -60,13 +63,10 @@ def run(args: Args) -> int:
             parts = {"colour": to_bytes(image), "depth": colour_depth(depth, limits)}
             yield np.concatenate(list(parts.values()), axis=1) if args.show == "both" else parts[args.show]
 
-    out = args.out.expanduser()
     if out.suffix.lower() == ".mp4":
         if len({(lens.width, lens.height) for _, lens in cameras}) > 1:
             raise InputError("The held-out views differ in size, so they cannot become a film; give a folder as OUT.")
         write_film(out, frames(), args.fps)
-    elif out.suffix:
-        raise InputError(f"{out} is neither a film (.mp4) nor a folder; give one of the two.")
     else:
         write_pictures(out, frames(), names)
     near, far = (limit * model.scene.frame.unit for limit in limits)

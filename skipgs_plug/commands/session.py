@@ -71,8 +71,8 @@ class Session:
             lost = f"{files} of {self._folder.root} could not be written"
             if not self._folder.checkpoints():
                 raise InputError(
-                    f"{lost}, and there is no checkpoint to continue from; make room, and give the same command again, "
-                    "without --resume: it trains from the start."
+                    f"{lost}, and there is no checkpoint to continue from; make room, and train from the start with "
+                    "another --out, without --resume."
                 )
             raise InputError(f"{lost}; make room, and the same command with --resume writes them.")
         if stop.exit_code:
@@ -116,23 +116,28 @@ class Session:
         return stats
 
     def _finish(self) -> None:
-        """Evaluate, and write all files of a finished run, including files that an earlier session could not write."""
-        folder, trainer = self._folder, self._trainer
+        """Evaluate, write all files of a finished run, also those that an earlier session could not write, and report.
+
+        The report comes last: a reader who is gone ends the command there.
+        """
+        folder, trainer, said = self._folder, self._trainer, []
         with keep_going(self._failed), folder.renders(trainer, self._split) as keep:
             stats = self._evaluate(self._failed, keep)
         with keep_going(self._failed):
             self._curve.write(folder.root / "stats" / "train_curve.json")
         with keep_going(self._failed):
-            print(folder.write_ply(trainer))
+            said.append(str(folder.write_ply(trainer)))
         if self._gate is not None:
             with keep_going(self._failed):
                 write_report(self._gate, folder.root / "skipgs.json", frame=trainer.scene.frame.as_dict())
-            print(self._gate.summary())
-        print(f"{self._described(stats)}; T_total {trainer.t_total:.1f} s, T_post {trainer.t_post:.1f} s")
+            said.append(self._gate.summary())
+        said.append(f"{self._described(stats)}; T_total {trainer.t_total:.1f} s, T_post {trainer.t_post:.1f} s")
+        print("\n".join(said))
 
     def _described(self, stats: dict[str, Any]) -> str:
         net = self._options.lpips_net
-        where = f"{stats['views']} held-out views" if self._split == "val" else "TRAINING views (none held out)"
+        held_out = f"{stats['views']} held-out view{'' if stats['views'] == 1 else 's'}"
+        where = held_out if self._split == "val" else "TRAINING views (none held out)"
         lpips = f", LPIPS ({net}) {stats[f'lpips_{net}']:.4f}" if net else ""
         fitted = f" ({stats['cc_psnr']:.2f} with colours fitted to each)" if "cc_psnr" in stats else ""
         return (

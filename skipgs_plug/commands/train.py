@@ -56,13 +56,17 @@ def run(args: Args) -> int:
         scene = load_scene(args.scene, *loading, images)
         trainer = Trainer(config, scene)
     settings = args.gate_options.given()
+    begun_with = GateSettings(None)
+    trainer.register_state("gate_settings", begun_with)  # before the gate, whose state says less about another setting
     gate = SkipGate(trainer, **settings) if args.gate or settings else None
-    trainer.register_state("gate_settings", GateSettings(gate))
+    begun_with.gate = gate
     curve = LossCurve(trainer)
     with exclusive(folder.root), gate or contextlib.nullcontext():
         if folder.checkpoints() != found:
             raise InputError(f"Another process trained in {args.out} just now; give the command again.")
         folder.remove_leftovers()
+        if not checkpoints:
+            folder.remove_evaluations()
         if checkpoints:
             first_sound(checkpoints, trainer.load_checkpoint)
         folder.write_config(trainer, None if gate is None else gate.config.as_dict())
@@ -107,6 +111,11 @@ def check(args: Args, checkpoints: list[Path]) -> None:
     require_folder(args.out)
     SkipConfig(**args.gate_options.given())
     given, scene = Path(args.scene).expanduser(), RunFolder(args.out).root / SCENE
+    if args.sfm and checkpoints and not is_scene(scene):
+        raise InputError(
+            f"{scene}, which --sfm makes, is not there, and {args.out} holds a run; give the scene that it was trained "
+            "on, without --sfm."
+        )
     reads_photographs = args.sfm and not (args.resume and is_scene(scene))
     if reads_photographs and not given.exists():
         raise MissingFileError(f"{args.scene} does not exist; give a video or a folder with photographs.")
@@ -124,6 +133,12 @@ def check(args: Args, checkpoints: list[Path]) -> None:
         require_lpips(args.session.lpips_net)
     if checkpoints and not args.resume:
         raise InputError(f"{args.out} already holds a run; add --resume to continue it or give another --out.")
+    results = RunFolder(args.out).results()
+    if results and not checkpoints:
+        raise InputError(
+            f"{args.out} holds a run without its checkpoints ({results[0]}), with which a new one would be mixed; give "
+            "another --out, or move its files away."
+        )
     if args.resume and not checkpoints:
         raise MissingFileError(f"{args.out} holds no checkpoint (ckpts/ckpt_*_rank0.pt); start without --resume.")
     if reads_photographs and is_scene(scene):

@@ -11,7 +11,7 @@ from skipgs_plug.bench.table import is_whole, legend, notes, tables
 from skipgs_plug.report import plots
 from skipgs_plug.report.elements import Details, Element, Picture, Section, Strip, Table, Text, write_page
 from skipgs_plug.report.phases import phase_elements
-from skipgs_plug.report.source import BenchSource, RunSource
+from skipgs_plug.report.source import SPLITS, BenchSource, RunSource
 
 GATE_HEADING = (
     "run",
@@ -33,9 +33,11 @@ REFINEMENT_HEADING = (
     "ended early",
     "remaining gain, upper bound, dB",
 )
-FITTED = "held-out PSNR, colours fitted, dB"
+PSNR = {split: f"{split} PSNR, dB" for split in SPLITS.values()}
+FITTED = "PSNR, colours fitted, dB"
+RARE = (PSNR["training"], FITTED)  # rows that only runs without held-out views have, or with --exposure
 RESULTS = (
-    "held-out PSNR, dB",
+    *PSNR.values(),
     FITTED,
     "worst view, dB",
     "SSIM",
@@ -45,7 +47,7 @@ RESULTS = (
     "backwards skipped, %",
 )
 FOLDERS = ("data_dir", "result_dir")  # settings that do not change the model
-PICTURED = 3  # number of held-out views of each run that the page shows, the worst ones
+PICTURED = 3  # number of evaluated views of each run that the page shows, the worst ones
 
 
 def build_page(sources: Sequence[RunSource | BenchSource]) -> str:
@@ -66,7 +68,7 @@ def comparison(runs: Sequence[RunSource]) -> Section:
     if curves:
         elements.append(picture(plots.loss_over_time(curves), "Training loss over iterations."))
         elements.append(picture(plots.gaussians_over_time(curves, {}), "Number of Gaussians over training time."))
-    views = {name: run.views for name, run in names.items() if run.views}
+    views = {name: run.views for name, run in names.items() if run.views and run.split == SPLITS["val"]}
     if views:
         elements.append(picture(plots.quality_of_views(views), "PSNR of each held-out view; dashed: mean of each run."))
     return Section("Side by side", elements)
@@ -99,14 +101,16 @@ def run_section(run: RunSource) -> Section:
         elements.append(picture(plots.loss_over_time({run.name: run.curve}), "Training loss over iterations."))
         elements.append(gaussians(run))
     if run.views:
-        elements.append(picture(plots.quality_of_views({run.name: run.views}), "PSNR of held-out views; dashed: mean."))
+        caption = f"PSNR of {run.split} views; dashed: mean."
+        elements.append(picture(plots.quality_of_views({run.name: run.views}), caption))
     elements += pictured_views(run)
     if run.gate is not None:
         elements += gate_elements(run.name, run.gate)
     if run.views:
         names = list(run.views[0])
         rows = [[rounded(row[name]) for name in names] for row in run.views]
-        elements.append(Details(f"Table of {len(rows)} held-out views", [Table("Held-out views", names, rows)]))
+        table = Table("Evaluated views", names, rows)
+        elements.append(Details(f"Table of {len(rows)} evaluated views, {run.split}", [table]))
     if run.metrics:
         metrics = [(name, rounded(value)) for name, value in run.metrics.items()]
         elements.append(Details("Last evaluation", [Table("Last evaluation", ("metric", "value"), metrics, text=True)]))
@@ -126,13 +130,13 @@ def gaussians(run: RunSource) -> Picture:
 
 
 def pictured_views(run: RunSource) -> list[Element]:
-    """Return pictures of the worst held-out views, or of the first ones if their quality is unknown."""
+    """Return pictures of the worst evaluated views, or of the first ones if their quality is unknown."""
     if len(run.views) != len(run.renders):
         return [Strip(path.name, plots.split_render(path)) for path in run.renders[:PICTURED]]
     worst = sorted(zip(run.views, run.renders, strict=True), key=lambda pair: pair[0]["psnr"])[:PICTURED]
     return [
         Strip(
-            f"{row['view']}: {row['psnr']:.2f} dB, {place} of {len(run.views)} held-out views.",
+            f"{row['view']}: {row['psnr']:.2f} dB, {place} of {len(run.views)} {run.split} views.",
             plots.split_render(path),
         )
         for place, (row, path) in zip(("worst", "second worst", "third worst"), worst, strict=False)
@@ -183,7 +187,7 @@ def results(caption: str, runs: Sequence[RunSource]) -> Table:
         if run.gate is not None and run.gate["gated_iterations"]:
             skipped = 100 * run.gate["backwards_skipped"] / run.gate["gated_iterations"]
         values = (
-            (run.metrics.get("psnr"), ".2f"),
+            *((run.metrics.get("psnr") if run.split == split else None, ".2f") for split in PSNR),
             (run.metrics.get("cc_psnr"), ".2f"),
             (worst, ".2f"),
             (run.metrics.get("ssim"), ".4f"),
@@ -194,7 +198,7 @@ def results(caption: str, runs: Sequence[RunSource]) -> Table:
         )
         columns.append(["-" if value is None else format(value, form) for value, form in values])
     rows = [[name, *cells] for name, *cells in zip(RESULTS, *columns, strict=True)]
-    rows = [row for row in rows if row[0] != FITTED or set(row[1:]) != {"-"}]  # only runs with --exposure have it
+    rows = [row for row in rows if row[0] not in RARE or set(row[1:]) != {"-"}]
     return Table(caption, ("", *unique_names(runs)), rows)
 
 

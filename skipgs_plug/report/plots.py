@@ -82,7 +82,7 @@ def gaussians_over_time(curves: Mapping[str, Mapping[str, list[float]]], ends: M
 
 
 def quality_of_views(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
-    """Plot the PSNR of each held-out view, sorted by name, with one marker style per run."""
+    """Plot the PSNR of each evaluated view, sorted by name, with one marker style per run."""
     figure, axes = new_figure(WIDTH, 3.4)
     for i, (name, views) in enumerate(runs.items()):
         values = [row["psnr"] for row in views]
@@ -91,7 +91,7 @@ def quality_of_views(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
             range(len(views)), values, linestyle="none", marker=marker, markersize=5, color=colour, label=label_of(name)
         )
         axes.axhline(float(np.mean(values)), color=colour, linewidth=0.8, linestyle="--")
-    axes.set_xlabel("held-out view, by name")
+    axes.set_xlabel("view, by name")
     axes.set_ylabel("PSNR (dB)")
     axes.xaxis.get_major_locator().set_params(integer=True)
     if len(runs) > 1:

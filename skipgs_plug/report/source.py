@@ -38,7 +38,8 @@ BENCH_PICTURES = {
     "skipped_views.png": "Skipped visits of each training view over iterations.",
     "loss_and_mean.png": "Loss of single views against their running mean; skipped visits are hollow.",
 }
-EVALUATIONS = "stats/val_step*.json"
+SPLITS = {"val": "held-out", "train": "training"}  # views that were evaluated, by the beginning of file names
+EVALUATIONS = "stats/{}_step*.json"
 CURVE = "train_curve.json"
 CURVE_FIELDS = ("step", "seconds", "loss", "num_GS")
 
@@ -56,6 +57,7 @@ class RunSource:
         renders: Pictures of that evaluation, each with the photograph and the render.
         curve: Columns `step`, `seconds`, `loss`, `num_GS` of the training curve; empty if the trainer wrote none.
         settings: Settings of the training; empty if unknown.
+        split: Which views were evaluated: held-out ones, or the training views of a run that held out none.
     """
 
     name: str
@@ -66,18 +68,24 @@ class RunSource:
     renders: list[Path] = field(default_factory=list)
     curve: dict[str, list[float]] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
+    split: str = SPLITS["val"]
 
     @property
     def t_total(self) -> float | None:
         """Training time in seconds; None if unknown."""
-        if self.gate is not None:
-            return float(self.gate["t_total"])
-        return self.curve["seconds"][-1] if self.curve.get("seconds") else None
+        seconds = self._seconds("t_total")
+        if seconds is None and self.curve.get("seconds"):
+            return self.curve["seconds"][-1]
+        return seconds
 
     @property
     def t_post(self) -> float | None:
         """Training time after densification in seconds; None if unknown."""
-        return float(self.gate["t_post"]) if self.gate is not None else None
+        return self._seconds("t_post")
+
+    def _seconds(self, name: str) -> float | None:
+        value = (self.metrics if self.gate is None else self.gate).get(name)
+        return None if value is None else float(value)
 
 
 @dataclass
@@ -114,7 +122,7 @@ def read_source(path: str | Path) -> RunSource | BenchSource:
         run = read_run(name, folder, None)
         if not run.metrics and not run.curve:
             raise SkipGSError(
-                f"{folder} holds neither skipgs.json, bench.json nor {EVALUATIONS}; give the folder of a "
+                f"{folder} holds neither skipgs.json, bench.json nor {EVALUATIONS.format('val')}; give the folder of a "
                 "finished run (skipgs-plug train or run), or of a bench."
             )
         return run
@@ -130,13 +138,14 @@ def read_source(path: str | Path) -> RunSource | BenchSource:
 
 def read_run(name: str, folder: Path, gate: dict[str, Any] | None) -> RunSource:
     """Read all files of a run folder except skipgs.json, whose content is `gate`."""
-    metrics, renders = last_evaluation(folder)
+    beginning, metrics, renders = last_evaluation(folder)
     views = metrics.pop("per_view", [])
     curve = folder / "stats" / CURVE
     columns = read_object(curve) if curve.is_file() else {}
     if columns and not all(isinstance(columns.get(name), list) for name in CURVE_FIELDS):
         raise SkipGSError(f"{curve} is damaged (it lacks one of {', '.join(CURVE_FIELDS)}); remove it.")
-    return RunSource(name, folder, gate, metrics, views, renders, columns, read_settings(folder))
+    split = SPLITS[beginning]
+    return RunSource(name, folder, gate, metrics, views, renders, columns, read_settings(folder), split)
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
@@ -172,15 +181,19 @@ def require(file: Path, data: dict[str, Any], fields: tuple[str, ...], version: 
         raise SkipGSError(f"{file} is damaged (no {missing[0]!r} in it); repeat the run, or leave the file out.")
 
 
-def last_evaluation(folder: Path) -> tuple[dict[str, Any], list[Path]]:
-    """Return metrics and pictures of the last evaluation in gsplat's file layout; empty if there is none."""
-    found = [(step_of(path), path) for path in folder.glob(EVALUATIONS)]
-    if not found:
-        return {}, []
-    step, path = max(found)
-    return read_object(path), sorted((folder / "renders").glob(f"val_step{step}_*.png"))
+def last_evaluation(folder: Path) -> tuple[str, dict[str, Any], list[Path]]:
+    """Return the last evaluation in gsplat's file layout: a key of `SPLITS`, metrics, and pictures.
+
+    Metrics and pictures are empty if there is none. Training views count if no held-out ones were evaluated.
+    """
+    for beginning in SPLITS:
+        found = [(step_of(path), path) for path in folder.glob(EVALUATIONS.format(beginning))]
+        if found:
+            step, path = max(found)
+            return beginning, read_object(path), sorted((folder / "renders").glob(f"{beginning}_step{step}_*.png"))
+    return "val", {}, []
 
 
 def step_of(path: Path) -> int:
-    digits = path.stem.removeprefix("val_step")
+    digits = path.stem.partition("_step")[2]
     return int(digits) if digits.isdigit() else -1

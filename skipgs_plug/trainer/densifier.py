@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import torch
@@ -16,6 +17,8 @@ from skipgs_plug.trainer.order import derive_seed
 from skipgs_plug.trainer.row_order import sort_rows, sorts_rows
 from skipgs_plug.trainer.seeded import seeded
 from skipgs_plug.trainer.strategy import create_strategy, reset_opacity_if_missed
+
+log = logging.getLogger(__name__)
 
 
 class Densifier:
@@ -46,6 +49,12 @@ class Densifier:
         self._splats, self._optimizers = splats, optimizers
         self._stop = config.scaled(config.recipe.refine_stop_iter)
         self.mcmc = Mcmc(config, scene_scale) if config.strategy == "mcmc" else None
+        count = len(splats["means"])
+        if self.mcmc is not None and count > config.cap_max:
+            log.warning(
+                "The scene starts with %d Gaussians, more than cap_max=%d: MCMC adds none and removes none.",
+                *(count, config.cap_max),
+            )
         self.strategy: Any = None
         self.state: dict[str, Any] = {}
         if self.mcmc is None:

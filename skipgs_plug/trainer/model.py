@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,13 @@ from torch import Tensor, nn
 from skipgs_plug.trainer.backend import Backend
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.errors import InputError
-from skipgs_plug.trainer.near_plane import before_a_lens
+from skipgs_plug.trainer.near_plane import before_a_lens, far_plane, shows_a_point
 from skipgs_plug.trainer.row_order import morton_order, take
 from skipgs_plug.trainer.scene import Scene
 from skipgs_plug.trainer.selective_adam import SelectiveAdam
 from skipgs_plug.trainer.sh0 import sh0_of
+
+log = logging.getLogger(__name__)
 
 ADAM_EPS = 1e-15  # as in gsplat's and Inria's trainers: the root of a second moment can be far below torch's 1e-8
 
@@ -45,6 +48,12 @@ def create_splats(scene: Scene, config: TrainConfig, device: torch.device, near:
                 f"{near * scene.frame.unit:g}; lower --near-plane or leave it out."
             )
         tensors = {name: tensor[~wrong] for name, tensor in tensors.items()}
+    if not shows_a_point(scene.train, tensors["means"], near, far_plane(config, scene)):
+        log.warning(
+            "None of the %d training views of %s shows one of its %d points, so its pictures may stay empty; check "
+            "that cameras and points have the same axes, unit and origin.",
+            *(len(scene.train), scene.name, len(tensors["means"])),
+        )
     order = morton_order(tensors["means"])
     return nn.ParameterDict({name: nn.Parameter(take(tensor, order).to(device)) for name, tensor in tensors.items()})
 

@@ -79,6 +79,12 @@ def before_a_lens(views: list[View], points: torch.Tensor, near: float) -> torch
     return hidden
 
 
+def shows_a_point(views: list[View], points: torch.Tensor, near: float, far: float) -> bool:
+    """Whether a point [M] projects into the picture of a view, at a depth between `near` and `far`."""
+    depths = (depths_in_picture(view, points) for view in views)
+    return any(bool(((depth > near) & (depth < far)).any()) for depth in depths)
+
+
 def depths_in_picture(view: View, points: torch.Tensor) -> torch.Tensor:
     """Return the depth of each point [M] whose place in the picture lies within its borders; -1 for the others."""
     camera = points.double() @ view.viewmat[:3, :3].double().T + view.viewmat[:3, 3].double()  # [M, 3]

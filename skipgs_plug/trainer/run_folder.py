@@ -22,6 +22,8 @@ from skipgs_plug.trainer.scene import View
 
 CHECKPOINT = re.compile(r"ckpt_(\d+)_rank0\.pt")
 SCENE = "scene"  # subfolder with the scene that `train --sfm` reconstructed
+RESULTS = ("ply/point_cloud_*.ply", "skipgs.json")
+EVALUATIONS = ("stats/*_step*.json", "stats/train_curve.json", "renders/*_step*.png")
 KEPT = 2  # checkpoints to keep: the older one serves if the last is damaged
 MOST_WAITING = 2  # renders that may wait for a slow disk, which bounds memory
 FOLDERS = ("", "ckpts", "ply", "stats", "renders")
@@ -34,12 +36,16 @@ class RunFolder:
         self.root = Path(root).expanduser()
 
     def write_config(self, trainer: Trainer, gate: dict[str, Any] | None) -> None:
-        """Write cfg.yml: the settings, the near plane in units of the dataset, the frame, and the gate's settings."""
+        """Write cfg.yml: the settings, those that others decide too, the frame, and the gate's settings.
+
+        The near plane is in units of the dataset.
+        """
         import yaml
 
         frame = trainer.scene.frame
         content = {
             **dataclasses.asdict(trainer.config),
+            "schedule_steps": trainer.config.schedule,
             "near_plane": frame.dataset_length(trainer.near_plane),
             "frame": frame.as_dict(),
             "gate": gate,
@@ -61,6 +67,16 @@ class RunFolder:
             (match, path) for path in (self.root / "ckpts").glob("*") if (match := CHECKPOINT.fullmatch(path.name))
         ]
         return [path for match, path in sorted(found, key=lambda entry: -int(entry[0][1]))]
+
+    def results(self) -> list[Path]:
+        """Return the models and the gate's report of a run that ended."""
+        return sorted(path for pattern in RESULTS for path in self.root.glob(pattern))
+
+    def remove_evaluations(self) -> None:
+        """Remove what a run measured that left no checkpoint: readers would take it for that of the next run."""
+        for pattern in EVALUATIONS:
+            for path in self.root.glob(pattern):
+                path.unlink(missing_ok=True)
 
     def remove_leftovers(self) -> None:
         """Remove half-written files of a killed run. No other process may be writing to the folder."""

@@ -207,8 +207,23 @@ def test_a_full_disk_that_leaves_no_checkpoint_does_not_promise_to_resume(
         fail_to_write(patch, "ckpt_", ".ply")
         assert train(packed, tmp_path / "run") == 2
     error = capsys.readouterr().err
-    assert "no checkpoint" in error and "without --resume" in error and "--resume writes them" not in error
-    assert train(packed, tmp_path / "run", "--max-steps", "4") == 0  # the sentence gives this command
+    assert "no checkpoint" in error and "another --out, without --resume" in error
+    assert train(packed, tmp_path / "other", "--max-steps", "4") == 0
+
+
+def test_a_run_is_not_mixed_with_an_older_one(
+    tmp_path: Path, packed: str, whole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    shutil.rmtree(out / "ckpts")
+    assert train(packed, out) == 2
+    assert "run without its checkpoints" in capsys.readouterr().err
+    shutil.rmtree(out / "ply")
+    (out / "skipgs.json").unlink()  # as a run that was killed after an evaluation and before its first checkpoint
+    assert train(packed, out, "--max-steps", "4") == 0
+    assert sorted(path.name for path in (out / "stats").iterdir()) == ["train_curve.json", "val_step3.json"]
+    assert not list((out / "renders").glob("val_step59*"))
 
 
 def test_the_next_command_can_be_pasted(tmp_path: Path, packed: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -270,14 +285,20 @@ def test_a_run_whose_rates_fall_to_0_is_not_extended(
     ("options", "sentence"),
     [
         (["--threshold", "0.1"], r"gate.threshold=0.0, not 0.1"),
+        (["--refine-share", "0.5"], r"gate.refine_share=None, not 0.5"),
         (["--sh0-lr", "0.1"], r"sh0_lr=0.0025, not 0.1"),
     ],
 )
 def test_other_settings_are_refused(
-    packed: str, whole: Path, options: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+    packed: str,
+    whole: Path,
+    options: list[str],
+    sentence: str,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     assert train(packed, whole, "--resume", *options) == 2
-    assert sentence in capsys.readouterr().err
+    assert sentence in capsys.readouterr().err and not caplog.records  # no checkpoint is called damaged
 
 
 def test_two_processes_do_not_share_a_folder(tmp_path: Path, packed: str, capsys: pytest.CaptureFixture[str]) -> None:

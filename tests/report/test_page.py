@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import shutil
@@ -11,7 +12,7 @@ from report_browser import body_count
 from skipgs_plug.cli import main
 from skipgs_plug.report.phases import phases
 from skipgs_plug.report.plots import inline_svg, loss_over_time
-from skipgs_plug.trainer import TrainConfig, Trainer, load_scene
+from skipgs_plug.trainer import TrainConfig, Trainer, load_scene, save_packed
 from skipgs_plug.trainer.curve import LossCurve
 
 
@@ -48,8 +49,8 @@ def test_a_run_without_a_gate_is_shown_with_its_worst_view_first(ungated_folder,
     assert results["held-out PSNR, dB"] == f"{stats['psnr']:.2f}"
     assert results["worst view, dB"] == f"{worst['psnr']:.2f}"
     assert results["backwards skipped, %"] == "-"
-    seconds = json.loads((ungated_folder / "stats/train_curve.json").read_text())["seconds"]
-    assert results["training, s"] == f"{seconds[-1]:.1f}" and seconds[-1] > 0
+    assert results["training, s"] == f"{stats['t_total']:.1f}" and stats["t_total"] > 0
+    assert results["after densification, s"] == f"{stats['t_post']:.1f}"
     captions = re.findall(r"<figcaption>(.*?)</figcaption>", dom)
     first, second = (
         captions.index(caption) for caption in captions if "held-out views." in caption and "dB" in caption
@@ -58,6 +59,21 @@ def test_a_run_without_a_gate_is_shown_with_its_worst_view_first(ungated_folder,
     assert captions[second].startswith(best["view"])
     assert "Decisions of the gate" not in dom
     assert body_count(dom, "images") == body_count(dom, "decoded") == 3 + 6
+
+
+def test_a_run_that_holds_out_no_view_is_shown_with_its_training_views(scene_file, ungated_folder, tmp_path):
+    folder, packed, scene = tmp_path / "all", tmp_path / "all.npz", load_scene(scene_file)
+    save_packed(dataclasses.replace(scene, train=scene.train + scene.test, test=[]), packed)
+    assert main(["train", str(packed), "--out", str(folder), "--max-steps", "4", "--no-progress"]) == 0
+    page = make_page(tmp_path, folder).read_text(encoding="utf-8")
+    stats = json.loads((folder / "stats/train_step3.json").read_text())
+    results = dict(rows_of(page, "Results"))
+    assert results["training PSNR, dB"] == f"{stats['psnr']:.2f}" and results["held-out PSNR, dB"] == "-"
+    assert results["Gaussians"] == f"{stats['num_GS']:,}"
+    assert len(rows_of(page, "Evaluated views")) == stats["views"]
+    assert f"worst of {stats['views']} training views." in page
+    both = rows_of(make_page(tmp_path, folder, ungated_folder).read_text(encoding="utf-8"), "All runs")
+    assert [row.count("-") for row in both[:2]] == [1, 1]  # each run has its own kind of PSNR
 
 
 def test_pages_fit_a_phone(train_folder, bench_folder, script_folder, tmp_path):
@@ -115,6 +131,7 @@ def test_settings_that_differ_stand_beside_the_comparison(ungated_folder, script
     other = tmp_path / "other"
     shutil.copytree(ungated_folder, other)
     settings = (other / "cfg.yml").read_text()
+    assert "\nschedule_steps: 40\n" in settings  # as after a resume, which makes no difference
     (other / "cfg.yml").write_text(settings.replace("data_factor: 1", "data_factor: 4") + "newer: 1\n")
     page = make_page(tmp_path, ungated_folder, other, script_folder).read_text()
     assert rows_of(page, "Settings that differ") == [["data_factor", "1", "4", "-"]]

@@ -29,6 +29,15 @@ def trainer_of(scene: Scene, **settings: object) -> Trainer:
     return Trainer(TrainConfig(**config), scene)
 
 
+def test_a_cap_below_the_start_is_named(scene: Scene, caplog: pytest.LogCaptureFixture) -> None:
+    trainer_of(scene, cap_max=160)
+    assert not caplog.records
+    trainer = trainer_of(scene, cap_max=100)
+    assert "starts with 160 Gaussians, more than cap_max=100" in caplog.text
+    trainer.train(until=20, progress=False)
+    assert trainer.num_gaussians == 160
+
+
 def test_it_grows_to_its_cap_and_no_further(scene: Scene) -> None:
     trainer = trainer_of(scene)
     sizes, before = [], trainer.evaluate()["psnr"]

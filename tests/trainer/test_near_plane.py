@@ -75,3 +75,15 @@ def test_a_near_plane_behind_all_points_is_refused() -> None:
         InputError, match=r"All 1,000 points of .* are nearer than the near plane 50; lower --near-plane"
     ):
         Trainer(TrainConfig(max_steps=3, near_plane=50), scene())
+
+
+def test_points_that_no_view_shows_get_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    Trainer(TrainConfig(max_steps=3), scene())
+    assert not caplog.records
+    behind = scene()
+    behind.points[:, 2] *= -1
+    Trainer(TrainConfig(max_steps=3), behind)
+    assert "None of the 2 training views of two shows one of its 1000 points" in caplog.text
+    caplog.clear()
+    Trainer(TrainConfig(max_steps=3, far_plane=3.9), scene())
+    assert "check that cameras and points have the same axes, unit and origin" in caplog.text

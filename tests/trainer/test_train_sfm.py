@@ -59,7 +59,8 @@ def stopped(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     """A run folder with the scene of the photographs and no checkpoint, as if the run was killed while it trained."""
     run = tmp_path / "run"
     assert train(photos, run) == 0 and "Reconstructed." in capsys.readouterr().out
-    shutil.rmtree(run / "ckpts")
+    for name in ("ckpts", "ply"):
+        shutil.rmtree(run / name)
     return run
 
 
@@ -123,6 +124,18 @@ def test_a_run_is_resumed_although_photographs_were_added(
     assert train(photos, tmp_path / "run", "--resume", "--max-steps", "6") == 0
     shown = capsys.readouterr().out
     assert f"is used again, made of {photos}." in shown and shown.count("Reconstructed.") == 1
+
+
+def test_photographs_are_not_mapped_for_a_run_that_another_scene_began(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    assert train(photos, run) == 0
+    shutil.rmtree(run / "scene")
+    assert train(photos, run, "--resume") == 2
+    captured = capsys.readouterr()
+    assert "without --sfm" in captured.err and captured.out.count("Reconstructed.") == 1
+    assert not (run / "scene").exists()
 
 
 @pytest.mark.parametrize(

@@ -88,6 +88,7 @@ def test_a_ply_needs_a_scene_and_may_lack_normals(ply, scene_file, tmp_path, cap
         (("nowhere", "out"), "nowhere does not exist"),
         (("{empty}", "out"), "holds no model"),
         (("{run}", "film.gif"), "is neither a film (.mp4) nor a folder"),
+        (("{run}/gone", "film.gif"), "is neither a film (.mp4) nor a folder"),  # before a scene is read
         (("{run}", "{run}"), "not an empty folder"),
         (("{run}", "out", "--frames", "0"), "--frames 0 is too small"),
         (("{run}", "out.mp4", "--fps", "1001"), "--fps 1001 is too large"),

@@ -33,12 +33,17 @@ class Args:
     no_progress: bool = False
     """No progress bar."""
 
-    def __post_init__(self) -> None:
-        if not self.steps or not all(1 <= steps <= LONGEST for steps in self.steps):
-            raise InputError(f"--steps {' '.join(map(str, self.steps))}: give lengths of 1 to {LONGEST:,} iterations.")
-        if not (math.isfinite(self.seconds) and self.seconds > 0):
-            raise InputError(f"--seconds {self.seconds:g} is not a positive number; give seconds, such as 30.")
-
 
 def parse(argv: list[str]) -> Args:
-    return parse_as(Args, argv, "estimate")
+    """Return the options.
+
+    Raises:
+        InputError: A length or the number of seconds is out of its range. `Args` does not check them, since tyro would
+            answer with its own words.
+    """
+    args = parse_as(Args, argv, "estimate")
+    if not args.steps or not all(1 <= steps <= LONGEST for steps in args.steps):
+        raise InputError(f"--steps {' '.join(map(str, args.steps))}: give lengths of 1 to {LONGEST:,} iterations.")
+    if not (math.isfinite(args.seconds) and args.seconds > 0):
+        raise InputError(f"--seconds {args.seconds:g} is not a positive number; give seconds, such as 30.")
+    return args
