@@ -65,8 +65,6 @@ def run(args: Args) -> int:
         if folder.checkpoints() != found:
             raise InputError(f"Another process trained in {args.out} just now; give the command again.")
         folder.remove_leftovers()
-        if not checkpoints:
-            folder.remove_evaluations()
         if checkpoints:
             first_sound(checkpoints, trainer.load_checkpoint)
         folder.write_config(trainer, None if gate is None else gate.config.as_dict())
@@ -136,8 +134,8 @@ def check(args: Args, checkpoints: list[Path]) -> None:
     results = RunFolder(args.out).results()
     if results and not checkpoints:
         raise InputError(
-            f"{args.out} holds a run without its checkpoints ({results[0]}), with which a new one would be mixed; give "
-            "another --out, or move its files away."
+            f"{args.out} holds files of a run without a checkpoint ({results[0]}), with which a new run would be "
+            "mixed; give another --out, or move them away."
         )
     if args.resume and not checkpoints:
         raise MissingFileError(f"{args.out} holds no checkpoint (ckpts/ckpt_*_rank0.pt); start without --resume.")

@@ -22,8 +22,7 @@ from skipgs_plug.trainer.scene import View
 
 CHECKPOINT = re.compile(r"ckpt_(\d+)_rank0\.pt")
 SCENE = "scene"  # subfolder with the scene that `train --sfm` reconstructed
-RESULTS = ("ply/point_cloud_*.ply", "skipgs.json")
-EVALUATIONS = ("stats/*_step*.json", "stats/train_curve.json", "renders/*_step*.png")
+RESULTS = ("ply/point_cloud_*.ply", "skipgs.json", "stats/*.json", "renders/*_step*.png")
 KEPT = 2  # checkpoints to keep: the older one serves if the last is damaged
 MOST_WAITING = 2  # renders that may wait for a slow disk, which bounds memory
 FOLDERS = ("", "ckpts", "ply", "stats", "renders")
@@ -69,14 +68,8 @@ class RunFolder:
         return [path for match, path in sorted(found, key=lambda entry: -int(entry[0][1]))]
 
     def results(self) -> list[Path]:
-        """Return the models and the gate's report of a run that ended."""
+        """Return models, reports and evaluations: readers would take them for those of a run that begins here."""
         return sorted(path for pattern in RESULTS for path in self.root.glob(pattern))
-
-    def remove_evaluations(self) -> None:
-        """Remove what a run measured that left no checkpoint: readers would take it for that of the next run."""
-        for pattern in EVALUATIONS:
-            for path in self.root.glob(pattern):
-                path.unlink(missing_ok=True)
 
     def remove_leftovers(self) -> None:
         """Remove half-written files of a killed run. No other process may be writing to the folder."""
