@@ -163,7 +163,8 @@ def release(rank: int, folder: str, place: str, ranks: tuple[int, ...]) -> None:
     setattr(owner, name, fails)
     parameter = torch.nn.Parameter(torch.ones(1))
     parameter.register_hook(lambda grad: (dist.all_reduce(grad := grad.clone()), grad)[1])
-    gate = SkipGate(start_iter=20, warmup=5, min_bwd_ratio=0.0, refine_share=share, compensate=False)
+    papers = {"warmup": 5, "min_bwd_ratio": 0.0} if share is None else {"refine_share": share}
+    gate = SkipGate(start_iter=20, compensate=False, **papers)
     ran, said, poison = [], "", 1.0
     try:
         for now in gate.iterations(range(200), always=[60]):

@@ -147,7 +147,7 @@ def resumed(
     factor: float, *, before: bool = False, event: bool = False, share: float | None = None, steps: int = 40
 ) -> SkipGate:
     """A gate that learnt means of 1 and goes on with losses of `factor`; with an event before it is saved or after."""
-    settings: dict = {"start_iter": 0, "warmup": 2, "refine_share": share}
+    settings: dict = {"start_iter": 0, **({"warmup": 2} if share is None else {"refine_share": share})}
     first = SkipGate(**settings)
     for step in first.iterations(range(100)):  # with a share, the first iterations run
         if step == 20:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from skipgs_plug.core.caution import caution
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.pace.base import Pace
 from skipgs_plug.core.pace.compensated import Compensated
@@ -11,9 +12,11 @@ from skipgs_plug.core.pace.phased import Phased
 from skipgs_plug.core.pace.rates import ScaledRates
 from skipgs_plug.core.release import Release
 
+OF_PAPERS_GATE = ("threshold", "warmup", "min_bwd_ratio")  # settings that decide on nothing if a share is given
+
 
 def pace_of(config: SkipConfig, rates: ScaledRates, go_on: Callable[[int], None], release: Release) -> Pace:
-    """Return the pace for these settings.
+    """Return the pace for these settings; warn of those that have no effect beside a share.
 
     Args:
         config: Settings that the user gave.
@@ -22,5 +25,10 @@ def pace_of(config: SkipConfig, rates: ScaledRates, go_on: Callable[[int], None]
         release: Receives errors, and raises them or releases the gate.
     """
     if config.leaves_out:
+        usual = SkipConfig()
+        idle = [name for name in OF_PAPERS_GATE if getattr(config, name) != getattr(usual, name)]
+        if idle:
+            listed = ", ".join(idle)
+            caution(f"Only the paper's gate uses these settings, and share and refine_share do not: {listed}.", 5)
         return Phased(config, rates, go_on, release)
     return Compensated(config, rates) if config.compensates else Pace()

@@ -80,7 +80,7 @@ def test_auto_must_know_the_views():
 def test_views_named_twice_are_known_once():
     reports = []
     for views in (VIEWS, VIEWS * 40):
-        with SkipGate(start_iter=40, refine_share="auto", warmup=0) as gate:
+        with SkipGate(start_iter=40, refine_share="auto") as gate:
             Loop(end=600).train(gate, views=views)
         reports.append(gate.report()["refine_share"])
     assert reports[0] == reports[1] < 1
