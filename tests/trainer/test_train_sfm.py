@@ -59,7 +59,7 @@ def stopped(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     """A run folder with the scene of the photographs and no checkpoint, as if the run was killed while it trained."""
     run = tmp_path / "run"
     assert train(photos, run) == 0 and "Reconstructed." in capsys.readouterr().out
-    for name in ("ckpts", "ply"):
+    for name in ("ckpts", "ply", "stats", "renders"):
         shutil.rmtree(run / name)
     return run
 

@@ -46,7 +46,7 @@ def test_patched_also_lists_names_that_are_replaced_around_the_script(checkout, 
     before = {f"torch.{name}": resolve_name(f"torch.{name}") for name in names}
     seen = []
 
-    def note(checkpoints, path):
+    def note(checkpoints, path, contents):
         replaced = {name for name, own in before.items() if resolve_name(name) is not own}
         seen.append((set(checkpoints.gate.patched) & set(before), replaced))
 
