@@ -242,8 +242,9 @@ class Refining(Phase):
                 self._rates.scale(path_factor(share, progress, self._config.rate_peak, visible))
             return
         if not self._recovery.goes_on:
-            progress = self.stopping.progress(self.sampling.run / (self.share * (self._last + 1 - self._first)))
-            factor = path_factor(self.share, progress, self._config.rate_peak, self._rates.visibility.visible)
+            steps = self.share * (self._last + 1 - self._first)
+            progress, visible = self.stopping.progress(self.sampling.run / steps), self._rates.visibility.visible
+            factor = path_factor(self.share, progress, self._config.rate_peak, visible, steps)
             self._over = self.stopping.ended
             if self._over:
                 self._recovery.after_refinement(self.sampling.run, self._last)

@@ -149,6 +149,14 @@ def test_the_path_is_conserved():
     assert path_factor(0.4, 0.5, peak=3.0) == 1.5
 
 
+def test_steps_are_longer_where_there_are_few():
+    enough = path_factor(0.4, 0.5)
+    assert path_factor(0.4, 0.5, steps=1500) == path_factor(0.4, 0.5, steps=9000) == enough
+    assert path_factor(0.4, 0.5, steps=1500 / 1.44) == pytest.approx(1.2 * enough)
+    assert path_factor(0.4, 0.5, steps=300) == pytest.approx(1.6 * enough)
+    assert path_factor(0.4, 0.5, peak=3.0, steps=300) == 1.5
+
+
 @pytest.mark.parametrize(
     "group, shape, times",
     [
