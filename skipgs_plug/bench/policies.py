@@ -58,7 +58,9 @@ def stepping_as(name: str) -> GateMaker:
     """Return a function that runs every iteration with the learning-rate factors of policy `name`."""
 
     def make(trainer: Trainer, earlier: Earlier) -> SkipGate:
-        peak = path_factor(float(name.partition("=")[2]), 0.0, visible=earlier[name].gaussians_shown)
+        share = float(name.partition("=")[2])
+        steps = share * all_iterations(trainer, earlier)
+        peak = path_factor(share, 0.0, visible=earlier[name].gaussians_shown, steps=steps)
         return gate_with(refine_share=1.0, rate_peak=peak)(trainer, earlier)  # type: ignore[return-value]
 
     return make
