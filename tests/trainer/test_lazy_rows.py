@@ -149,13 +149,13 @@ def test_resumed_equals_uninterrupted(tmp_path: Path, narrow_scene: Scene, stop:
     assert_same(whole, second)
 
 
-@pytest.mark.parametrize("settings", [{}, {"refine_share": 0.5}])
+@pytest.mark.parametrize("settings", [{"warmup": 2}, {"refine_share": 0.5}])
 def test_a_gate_leaves_steps_out_of_both(
     monkeypatch: pytest.MonkeyPatch, narrow_scene: Scene, settings: dict[str, Any]
 ) -> None:
     trainers = Trainer(CONFIG, narrow_scene), dense(monkeypatch, CONFIG, narrow_scene)
     for trainer in trainers:
-        SkipGate(trainer, warmup=2, **settings)
+        SkipGate(trainer, **settings)
         trainer.train(progress=False)
     assert_same(*trainers)
 

@@ -20,7 +20,8 @@ def train(checkout, tmp_path):
     def run(name, *options, gate=()):
         folder = tmp_path / name
         folder.mkdir(exist_ok=True)
-        code = cli.main(["run", "inria", "--cpu", "--warmup", "10", *gate, "--", checkout, str(folder), *options])
+        warmup = [] if {"--share", "--refine-share"} & {*gate} else ["--warmup", "10"]
+        code = cli.main(["run", "inria", "--cpu", *warmup, *gate, "--", checkout, str(folder), *options])
         forget()
         return code, folder
 
