@@ -50,7 +50,9 @@ def gated(**settings: object) -> Run:
 def larger_steps(trainer: Trainer, earlier: Earlier) -> SkipGate:
     """Attach rate factors with which this short refinement covers the same distance as the own run's."""
     full = earlier[REFERENCE].iterations
-    peak = path_factor(min(1.0, trainer.max_steps / full), 0.0, visible=earlier[COPIED].gaussians_shown)
+    share = min(1.0, trainer.max_steps / full)
+    steps = trainer.max_steps - trainer.refine_stop_iter
+    peak = path_factor(share, 0.0, visible=earlier[COPIED].gaussians_shown, steps=steps)
     gate = gate_with(refine_share=1.0, rate_peak=peak)(trainer, earlier)
     assert gate is not None
     return gate
