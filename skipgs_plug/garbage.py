@@ -11,6 +11,8 @@ import contextlib
 import gc
 from collections.abc import Iterator
 
+_keeps = False  # whether the program keeps everything; a count says nothing, as Python 3.12 itself exempts objects
+
 
 @contextlib.contextmanager
 def uncollected() -> Iterator[None]:
@@ -23,7 +25,7 @@ def uncollected() -> Iterator[None]:
     try:
         yield
     finally:
-        if gc.get_freeze_count():
+        if _keeps:
             keep_everything()
         if running:
             gc.enable()
@@ -34,4 +36,6 @@ def keep_everything() -> None:
 
     For whole programs only: present cycles that become unreachable later are never freed.
     """
+    global _keeps
+    _keeps = True
     gc.freeze()

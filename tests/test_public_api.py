@@ -108,7 +108,7 @@ FACTS = (
     "steps_each: 'bool' = False, "
     "densification: 'Densification | None' = None, "
     "photographs: 'Callable[[], Iterable[Tensor]] | None' = None, "
-    "slow_positions: 'bool' = False, positions_rate: 'float' = 0.0, random_points: 'bool' = False, "
+    "slow_positions: 'bool' = False, positions_rate: 'float' = 0.0, random_points: 'bool | None' = None, "
     "defaults: 'Mapping[str, Any]' = <factory>) -> None"
 )
 POLICY = {

@@ -136,6 +136,7 @@ class GsplatRunner(AbstractAdapter):
         self.output_folder = runner.cfg.result_dir
         last = runner.cfg.max_steps - 1
         start, read_until = first_iterations(survey, strategy, last)
+        init_type = getattr(runner.cfg, "init_type", None)
         hooks.ready(
             TrainerInfo(
                 start,
@@ -145,7 +146,7 @@ class GsplatRunner(AbstractAdapter):
                 world_size=runner.world_size,
                 gradients_read_until=read_until,
                 densification=None if survey.unknown else strategy_events(strategy),
-                random_points=getattr(runner.cfg, "init_type", None) == "random",
+                random_points=None if init_type is None else init_type == "random",
                 photographs=None if survey.unknown else show_half_size_batches(hooks, runner),
             )
         )

@@ -142,6 +142,10 @@ class InriaFamily(MarkedScript):
         """Whether optimizers step at certain iterations, with gathered gradients. Arguments as for `start_iter`."""
         return False
 
+    def random_points(self, opt: Any, loop: Mapping[str, Any]) -> bool | None:
+        """Whether the scene begins with random points; see `TrainerInfo`. Arguments as for `start_iter`."""
+        return asks_for_random_points(loop)
+
     def attach(self, hooks: Hooks) -> None:
         names = namespace_of(self.trainer)
         if names is None or LOOP not in names or "GaussianModel" not in names:
@@ -310,7 +314,7 @@ class InriaFamily(MarkedScript):
                 steps_each=self.steps_each(opt, loop),
                 slow_positions=True,  # they reach their last rate in `position_lr_max_steps`, by default 30,000
                 positions_rate=rate_of_positions(held_by(self._model())),
-                random_points=asks_for_random_points(loop),
+                random_points=self.random_points(opt, loop),
                 photographs=None if self._cameras is None else self._cameras.photographs,
             )
         )

@@ -173,13 +173,15 @@ def names_around(caller: types.FrameType) -> Mapping[str, Any]:
     return ChainMap(*(dict(frame.f_locals) for frame in frames), frames[-1].f_globals)
 
 
-def asks_for_random_points(names: Mapping[str, Any]) -> bool:
+def asks_for_random_points(names: Mapping[str, Any]) -> bool | None:
     """Return whether the options of a loop ask for random points, as `--init_type random` of 3DGS-MCMC does.
+
+    The answer is None if there is no such option.
 
     Only the loop's own variables count: a script has objects with the defaults of all options, too.
     """
     given = (getattr(names.get(name), "init_type", None) for name in ("dataset", OPTIONS, "args"))
-    return next((init_type for init_type in given if init_type is not None), None) == "random"
+    return next((init_type == "random" for init_type in given if init_type is not None), None)
 
 
 def function_names(function: Callable[..., Any]) -> dict[str, Any]:

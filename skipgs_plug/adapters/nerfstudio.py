@@ -171,10 +171,14 @@ def callbacks(trainer: Any) -> Iterator[tuple[Callable[..., Any], int | None]]:
         yield getattr(callback, "func", callback), None if steps is None else max(steps, default=-1) + 1
 
 
-def begins_at_random(model: Any) -> bool:
-    """Return whether a Splatfacto model begins with random points: it was told to, or the scene has no points."""
-    told = getattr(getattr(model, "config", None), "random_init", False)
-    return bool(told) or getattr(model, "seed_points", ()) is None
+def begins_at_random(model: Any) -> bool | None:
+    """Return whether a Splatfacto model begins with random points: it was told to, or the scene has no points.
+
+    The answer is None if the model does not say which points it was given.
+    """
+    if getattr(getattr(model, "config", None), "random_init", False):
+        return True
+    return model.seed_points is None if hasattr(model, "seed_points") else None
 
 
 def view_names(files: list[Path]) -> list[str]:

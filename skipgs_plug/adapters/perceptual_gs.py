@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -34,6 +35,12 @@ class PerceptualGS(InriaFamily):
     def begin(self, opt: Any, loop: Mapping[str, Any]) -> None:
         if all(getattr(camera, "alpha", None) is None for camera in loop["scene"].getTrainCameras()):
             self.known_names["gt_alpha"] = None
+
+    def random_points(self, opt: Any, loop: Mapping[str, Any]) -> bool | None:
+        # The loss of sensitivities lowers most opacities in the first steps, so they tell nothing. The script's own
+        # reader of scenes makes random points where this folder is missing.
+        source = getattr(loop.get("dataset"), "source_path", None)
+        return None if source is None else not os.path.exists(os.path.join(source, "sparse"))
 
     def start_iter(self, opt: Any, loop: Mapping[str, Any]) -> int:
         return int(opt.densify_until_iter) + 1

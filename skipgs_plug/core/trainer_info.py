@@ -71,8 +71,8 @@ class TrainerInfo:
             half their size while `Hooks.at_half_size`; None if it cannot.
         slow_positions: Whether the trainer may lower the learning rate of positions too slowly for its schedule.
         positions_rate: First learning rate of positions then; 0 if it is not known.
-        random_points: Whether the trainer says that the scene begins with random points. They are also recognised by
-            opacities that fall, unless a regulariser lowers them all (MCMC).
+        random_points: Whether the scene begins with random points. If the trainer does not say, None: they are
+            recognised by opacities that fall, unless a regulariser lowers them all (MCMC).
         defaults: Settings that suit this trainer. They are used where the user gave no value.
     """
 
@@ -90,5 +90,5 @@ class TrainerInfo:
     photographs: Callable[[], Iterable[Tensor]] | None = None
     slow_positions: bool = False
     positions_rate: float = 0.0
-    random_points: bool = False
+    random_points: bool | None = None
     defaults: Mapping[str, Any] = dataclasses.field(default_factory=dict)

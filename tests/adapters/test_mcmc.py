@@ -47,10 +47,10 @@ def test_longer_steps_are_tolerated_where_opacities_are_never_reset():
 
 def test_the_options_of_the_loop_tell_of_random_points_and_not_their_defaults():
     random, sfm, other = SimpleNamespace(init_type="random"), SimpleNamespace(init_type="sfm"), SimpleNamespace()
-    assert asks_for_random_points({"dataset": random, "opt": other})
-    assert asks_for_random_points({"args": random})
-    assert not asks_for_random_points({"lp": random, "dataset": sfm, "args": random})
-    assert not asks_for_random_points({"lp": random, "dataset": other})
+    assert asks_for_random_points({"dataset": random, "opt": other}) is True
+    assert asks_for_random_points({"args": random}) is True
+    assert asks_for_random_points({"lp": random, "dataset": sfm, "args": random}) is False
+    assert asks_for_random_points({"lp": random, "dataset": other}) is None
 
 
 @pytest.mark.parametrize("init_type", ["sfm", "random"])

@@ -259,11 +259,11 @@ def test_conditions_of_a_pipeline_are_warned_of():
 @pytest.mark.parametrize(
     "model, random",
     [
-        (types.SimpleNamespace(), False),
+        (types.SimpleNamespace(), None),
         (types.SimpleNamespace(config=types.SimpleNamespace(random_init=False), seed_points=(1, 2)), False),
         (types.SimpleNamespace(config=types.SimpleNamespace(random_init=True), seed_points=(1, 2)), True),
         (types.SimpleNamespace(config=types.SimpleNamespace(random_init=False), seed_points=None), True),
     ],
 )
 def test_a_model_tells_of_random_points(model, random):
-    assert begins_at_random(model) == random
+    assert begins_at_random(model) is random

@@ -227,7 +227,8 @@ class Growing(Phase):
         self._visible = self._visible_now
         if self._visible is not None:
             # Where opacities are never reset, as in MCMC, a regulariser lets all of them fall.
-            self._fading = self._rates.fading.finish() and events.resets
+            told = plan.random_points is False or not events.resets
+            self._fading = self._rates.fading.finish() and not told
             if self._fading and not self._auto:
                 self._warn_of_fading(plan)
         if self._auto:
@@ -288,7 +289,7 @@ class Growing(Phase):
             "opacity_rate_factor": None if parts is None else parts.opacities,
             "times_grown": self._times_grown,
             "fading": self._fading,
-            "random_points": self._fading or plan.random_points,
+            "random_points": self._fading or bool(plan.random_points),
             **self.half_size.report(),
             "always_run": {reason: len(numbers) for reason, numbers in plan.always.items()},
         }

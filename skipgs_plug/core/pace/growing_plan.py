@@ -28,7 +28,7 @@ class GrowingPlan(NamedTuple):
         whole_from: Iteration from which all run; None if enough refinement follows.
         unrefined: Whether the run ends before it makes up for the growing phase.
         steps_after: Number of iterations that will run in the following phase.
-        random_points: Whether the trainer says that the points are random.
+        random_points: Whether the points are random; None if the trainer does not say.
     """
 
     events: DensificationEvents
@@ -44,7 +44,7 @@ class GrowingPlan(NamedTuple):
     whole_from: int | None
     unrefined: bool
     steps_after: int
-    random_points: bool
+    random_points: bool | None
 
     @property
     def all_must(self) -> bool:

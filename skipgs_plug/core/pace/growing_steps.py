@@ -41,5 +41,5 @@ def longer_steps(
     positions = geometry_part(factor, LONGEST_STEPS_OF_POSITIONS if far else LONGEST_STEPS_OF_POSITIONS_THAT_STAY)
     if plan.unrefined and not fading and not plan.steps_after:
         return factor, GrowingParts(opacities, positions, scales, True, HIGHEST_OPACITY_RATE)
-    remember = plan.random_points and not events.resets and visible < SELDOM_SHOWN
+    remember = bool(plan.random_points) and not events.resets and visible < SELDOM_SHOWN
     return factor, GrowingParts(opacities, positions, scales, events.clears_moments, all_remember=remember)

@@ -52,7 +52,8 @@ class LoopFacts:
         self._known: Known = nothing_known
         self._accumulates = self._steps_each = False
         self._photographs: Callable[[], Iterable[Tensor]] | None = None
-        self._slow_positions, self._positions_rate, self._random_points = False, 0.0, False
+        self._slow_positions, self._positions_rate = False, 0.0
+        self._random_points: bool | None = None
         self._views: list[str] | None = None
         self._epoch: int | None = None  # iterations that show every view once; None if that is the number of views
 

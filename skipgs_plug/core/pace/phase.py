@@ -30,7 +30,7 @@ class PhasePlan(NamedTuple):
         photographs: Returns some training photographs, if views can be shown at half their size; see `TrainerInfo`.
         slow_positions: Whether the learning rate of positions may fall too slowly; see `TrainerInfo`.
         positions_rate: First learning rate of positions then; 0 if it is not known.
-        random_points: Whether the scene is known to begin with random points; see `TrainerInfo`.
+        random_points: Whether the scene begins with random points; None if unknown. See `TrainerInfo`.
         steps_each: Optimizers would do so, but step in refinement as in densification; see `TrainerInfo`.
     """
 
@@ -46,7 +46,7 @@ class PhasePlan(NamedTuple):
     photographs: Callable[[], Iterable[Tensor]] | None = None
     slow_positions: bool = False
     positions_rate: float = 0.0
-    random_points: bool = False
+    random_points: bool | None = None
     steps_each: bool = False
 
     def epoch_for(self, setting: str) -> int:
