@@ -5,7 +5,7 @@ from cases import SCRIPTS, SkipAlways
 from lookalikes import edgs, faster_gs, fvdb, fvdb_frgs, gsplat_runner, litegs, nerfstudio, threedgrut
 from lookalikes.splats import log, new_log
 from test_unknown_changes import forked
-from test_unknown_forks import TRAIN, GaussianModel, from_file, train  # noqa: F401
+from unknown_fork import TRAIN, GaussianModel, train
 
 from skipgs_plug import AdapterMismatchError, SkipGate, SkipGSError
 from skipgs_plug.adapters.loop_bounds import READS_GRADIENT, CallReader
@@ -58,15 +58,15 @@ class Reading(GaussianModel):
 def reading(make, monkeypatch, call):
     """A fork that makes this call between its backward and its step."""
     step = "            gaussians.optimizer.step()\n"
-    monkeypatch.setattr("test_unknown_forks.TRAIN", TRAIN.replace(step, f"            {call}\n{step}"))
-    monkeypatch.setattr("test_unknown_forks.GaussianModel", Reading)
+    monkeypatch.setattr("unknown_fork.TRAIN", TRAIN.replace(step, f"            {call}\n{step}"))
+    monkeypatch.setattr("unknown_fork.GaussianModel", Reading)
     return make()
 
 
 @pytest.mark.filterwarnings(r"ignore:.*Not recognised.*clip\(\)")
 @pytest.mark.parametrize("settings", [{"policy": SkipAlways()}, {"refine_share": 0.5}])
 @pytest.mark.parametrize("call", ["gaussians.add_densification_stats()", "gaussians.clip()"])
-def test_reads_in_methods_of_the_model_are_seen(call, settings, from_file, monkeypatch):  # noqa: F811
+def test_reads_in_methods_of_the_model_are_seen(call, settings, from_file, monkeypatch):
     bounded = reading(from_file, monkeypatch, f"if iteration < opt.prune_until_iter: {call}")
     with (
         pytest.warns(RuntimeWarning, match="the grad of a tensor until iteration 29"),
@@ -80,13 +80,13 @@ def test_reads_in_methods_of_the_model_are_seen(call, settings, from_file, monke
 
 
 @pytest.mark.filterwarnings("ignore:The gate starts at iteration 30")
-def test_a_start_before_the_last_read_is_refused(from_file, monkeypatch):  # noqa: F811
+def test_a_start_before_the_last_read_is_refused(from_file, monkeypatch):
     fork = reading(from_file, monkeypatch, "if iteration < opt.prune_until_iter: gaussians.add_densification_stats()")
     with pytest.raises(SkipGSError, match="start_iter=25 is too early"), SkipGate(fork, start_iter=25):
         train(fork)
 
 
-def test_a_run_that_ends_before_densification_is_not_refused(from_file, monkeypatch):  # noqa: F811
+def test_a_run_that_ends_before_densification_is_not_refused(from_file, monkeypatch):
     fork = reading(from_file, monkeypatch, "if iteration < opt.densify_until_iter: gaussians.add_densification_stats()")
     with SkipGate(fork, policy=SkipAlways()) as gate:
         train(fork, densify_until_iter=50)

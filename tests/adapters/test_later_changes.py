@@ -7,7 +7,7 @@ from cases import SCRIPTS, SkipAlways
 from lookalikes import gsplat_runner, lightgaussian_distill, nerfstudio, threedgrut
 from lookalikes.splats import new_log
 from test_unknown_changes import forked, gate_of
-from test_unknown_forks import train, unknown_fork
+from unknown_fork import train, unknown_fork
 
 from skipgs_plug import SkipGate
 

@@ -1,98 +1,14 @@
 """Forks that no adapter knows are refused, warned about, or run without a gate, as their loop requires."""
 
-import re
-import types
-
 import pytest
 import torch
 from cases import SkipAlways
-from lookalikes.splats import Scene, SplatModel, dataset, draw, log, new_log, photo_loss, pick
+from lookalikes.splats import log
+from unknown_fork import HELPERS, INNER, TRAIN, train, unknown_fork
 
 from skipgs_plug import AdapterMismatchError, SkipGate
 from skipgs_plug.adapters.inria import Inria
 from skipgs_plug.adapters.registry import find_script_adapter
-
-TRAIN = """
-def training(dataset, opt, pipe):
-    gaussians = GaussianModel()
-    scene = Scene(dataset, gaussians)
-    gaussians.training_setup(opt)
-    {before}
-    for iteration in range(1, opt.iterations + 1):
-        log.begins(iteration, gaussians.values.values())
-        gaussians.update_learning_rate(iteration)
-        viewpoint_cam = pick(scene.getTrainCameras(), iteration)
-        loss = photo_loss(render(viewpoint_cam, gaussians{argument})["render"], viewpoint_cam)
-        loss.backward()
-        with torch.no_grad():
-            if iteration < opt.densify_until_iter: pass
-            gaussians.optimizer.step()
-            gaussians.optimizer.zero_grad(set_to_none=True)
-            {extra}
-    {after}
-"""
-
-
-INNER = "def inner(loss):\n        loss.backward()"
-HELPERS = """
-def set_rates(gaussians, number):
-    gaussians.update_learning_rate(number)
-
-def optimise(loss):
-    loss.backward()
-"""
-
-
-class GaussianModel(SplatModel):
-    def shake(self):
-        self.values["xyz"].add_(0.01)
-
-    def count(self):
-        self.counted = True
-
-    def get_features(self):
-        return self.values["f_dc"]
-
-    def compute_3D_filter(self):
-        self.filter = self.values["xyz"].detach().abs()
-
-    def thin(self):
-        for one in self.optimizer.param_groups:
-            one["params"][0] = self.values[one["name"]] = torch.nn.Parameter(one["params"][0].detach()[:-1])
-
-
-def render(viewpoint_camera, pc, kernel_size=0.3):
-    return draw(viewpoint_camera, pc.values)
-
-
-@pytest.fixture
-def from_file(tmp_path):
-    """Make the training module from a file, whose conditions can be read."""
-
-    def make(**parts):
-        return unknown_fork(**parts, file=tmp_path / "train.py")
-
-    return make
-
-
-def unknown_fork(argument="", extra="pass", densification=None, before="pass", after="", file=None, helper=""):
-    module = types.ModuleType("train")
-    own = {"GaussianModel": type("GaussianModel", (GaussianModel,), {}), "render": render, "Scene": Scene}
-    module.__dict__.update(own, log=log, pick=pick, photo_loss=photo_loss, torch=torch)
-    source = TRAIN.format(argument=argument, extra=extra, before=before, after=after) + helper
-    if densification is not None:
-        source = source.replace("if iteration < opt.densify_until_iter: pass", densification)
-    if file is not None:
-        file.write_text(source)
-    exec(compile(source, str(file or "train"), "exec"), vars(module))
-    return module
-
-
-def train(module, **options):
-    new_log()
-    opt = types.SimpleNamespace(iterations=40, densify_until_iter=20, prune_until_iter=30)
-    opt.__dict__.update(options)
-    module.training(dataset(), opt, None)
 
 
 def test_inrias_own_loop_is_not_an_unknown_fork():
@@ -277,122 +193,6 @@ def test_what_changes_no_values_in_the_loop_is_not_refused(from_file, parts):
     assert gate.report()["backwards_skipped"] == 21
 
 
-def test_loop_in_a_function_that_training_calls_is_refused():
-    fork = unknown_fork(
-        helper="\nreconstruct = training\ndef training(dataset, opt, pipe):\n    reconstruct(dataset, opt, pipe)\n"
-    )
-    with pytest.raises(
-        AdapterMismatchError,
-        match=r"training\(\) does not call loss.backward\(\), reconstruct\(\) calls backward in its place, .* not",
-    ):
-        SkipGate(fork)
-
-
-def test_a_loop_without_a_variable_of_options_is_refused_before_it_begins(monkeypatch):
-    monkeypatch.setattr("test_unknown_forks.TRAIN", re.sub(r"\bopt\b", "cfg", TRAIN))
-    with pytest.raises(AdapterMismatchError, match=r"training\(\) has no variable 'opt', whose .* by hand"):
-        SkipGate(unknown_fork())
-    options = "opt = types.SimpleNamespace(iterations=40, densify_until_iter=20)\n"
-    monkeypatch.setattr("test_unknown_forks.TRAIN", f"import types\n{options}" + TRAIN.replace("opt, pipe", "pipe, _"))
-    with SkipGate(unknown_fork(), policy=SkipAlways()) as gate:
-        train(gate.adapter.trainer)
-    assert gate.report()["backwards_skipped"] == 21
-
-
-def test_functions_that_the_loop_calls_are_read_too():
-    helper = "\ndef nudge(gaussians):\n    inner(gaussians)\n\ndef inner(gaussians):\n    gaussians.count()\n"
-    with pytest.warns(RuntimeWarning, match=r"in skipped iterations: count\(\)"):
-        SkipGate(unknown_fork(extra="nudge(gaussians)", helper=helper)).detach()
-    writes = helper.replace("gaussians.count()", "gaussians.values['xyz'].add_(1.0)")
-    with pytest.raises(AdapterMismatchError, match=r"itself changes values \(add_\)"):
-        SkipGate(unknown_fork(extra="nudge(gaussians)", helper=writes))
-
-
-@pytest.mark.parametrize(
-    ("extra", "start"),
-    [
-        ("if iteration < opt.prune_until_iter: gaussians.count()", 30),
-        ("if opt.prune_until_iter >= iteration and iteration % 5 == 0: gaussians.count()", 31),
-        ("if iteration in [24, 28]: gaussians.count()", 29),
-        ("if iteration == 300: gaussians.count()", 20),  # the run ends before
-        ("gaussians.count()", 20),
-        ("if iteration > 10: gaussians.count()", 20),
-        ("if iteration < 25 or opt.prune_until_iter: gaussians.count()", 20),
-    ],
-)
-def test_gate_begins_after_the_last_call_that_is_not_recognised(extra, start, from_file):
-    with pytest.warns(RuntimeWarning, match="count"):
-        gate = SkipGate(from_file(extra=extra), policy=SkipAlways())
-    with gate:
-        if start > 20:
-            with pytest.warns(RuntimeWarning, match=rf"starts at iteration {start} instead of 20: .* count\(\)"):
-                train(gate.adapter.trainer)
-        else:
-            train(gate.adapter.trainer)
-    assert gate.config.start_iter == start and gate.report()["backwards_skipped"] == 41 - start
-
-
-REPORT = """
-def report(model):
-    log.norm = model.values["xyz"].grad.data.norm()
-"""
-
-
-@pytest.mark.parametrize("settings", [{}, {"share": 0.5}])
-@pytest.mark.parametrize(
-    "extra", ["report(gaussians)", "if opt.logs and iteration % 2: log.last = gaussians.values['xyz'].grad.norm()"]
-)
-def test_a_loop_that_reads_gradients_until_its_end_is_refused(extra, settings, from_file):
-    """GES logs norms of gradients. A skipped iteration would end its run, such as the last one, before it saves."""
-    module = from_file(extra=extra, helper=REPORT)
-    with (
-        pytest.raises(AdapterMismatchError, match=r"its loop reads gradients \(grad\) until its end"),
-        SkipGate(module, **settings),
-    ):
-        train(module, logs=True)
-    assert not log.backwards
-
-
-@pytest.mark.parametrize("settings", [{}, {"refine_share": 0.5}])
-def test_a_loop_that_puts_the_end_of_densification_off_is_refused(settings, from_file):
-    """Binocular3DGS densifies until the end if its opacities decay."""
-    module = from_file(extra="if opt.logs and iteration > 10: opt.densify_until_iter = opt.iterations")
-    with (
-        pytest.raises(AdapterMismatchError, match="its loop itself sets densify_until_iter or"),
-        SkipGate(module, **settings),
-    ):
-        train(module, logs=True)
-    assert not log.backwards
-    with SkipGate(module, **settings):
-        train(module, logs=False)
-
-
-@pytest.mark.parametrize(
-    ("extra", "start"),
-    [
-        ("if opt.logs: report(gaussians)", 20),
-        ("if gaussians.values['xyz'].grad is not None: report(gaussians)", 20),
-        ("if iteration < opt.prune_until_iter: log.last = gaussians.values['xyz'].grad", 30),
-    ],
-)
-def test_a_loop_that_reads_no_gradient_of_a_skipped_iteration_is_gated(extra, start, from_file):
-    with SkipGate(from_file(extra=extra, helper=REPORT), policy=SkipAlways()) as gate:
-        if start > 20:
-            with pytest.warns(RuntimeWarning, match="the loop calls for the grad of a tensor until iteration 29"):
-                train(gate.adapter.trainer, logs=False)
-        else:
-            train(gate.adapter.trainer, logs=False)
-    assert gate.config.start_iter == start and gate.report()["backwards_skipped"] == 41 - start
-
-
-def test_later_prunes_of_a_fork_put_the_start_off_too(from_file):
-    extra = "if iteration <= opt.prune_until_iter: gaussians.prune_points(torch.zeros(30, dtype=torch.bool))"
-    sentence = r"the loop calls prune_points\(\) until iteration 30"
-    with SkipGate(from_file(extra=extra), policy=SkipAlways()) as gate, pytest.warns(RuntimeWarning, match=sentence):
-        train(gate.adapter.trainer)
-    assert gate.config.start_iter == 31
-
-
 def test_failure_of_the_gates_own_code_loses_no_run(monkeypatch):
     def broken(self, opt, loop):
         return opt.no_such_option
@@ -448,7 +248,7 @@ def test_a_loop_that_does_the_same_in_other_words_is_gated(way, tmp_path, monkey
     source = TRAIN
     for old, new in (("{before}", "pass"), *OTHER_WAYS[way]):
         source = source.replace(old, new)
-    monkeypatch.setattr("test_unknown_forks.TRAIN", source)
+    monkeypatch.setattr("unknown_fork.TRAIN", source)
     fork = unknown_fork(helper=HELPERS, file=tmp_path / "train.py")
     with SkipGate(fork, policy=SkipAlways()) as gate:
         train(fork)
