@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import os
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -49,7 +50,7 @@ BUILTIN = {
 }
 
 SHOWN = 6  # functions of an unknown script that the error names, at most: it stays one sentence
-SCRIPT_NAME = re.compile(r"[\w./-]+\.py\b")
+SCRIPT_NAME = re.compile(r"(?<![\w./-])[\w./-]+\.py\b")  # from the first letter on: texts can be megabytes long
 
 _registered: dict[str, type[AbstractAdapter]] = {}
 
@@ -141,9 +142,9 @@ def find_script_adapter(script: Path) -> type[AbstractAdapter]:
     if not code.calls_backward and (started := _training_scripts_named_in(script)):
         names = _listed(started)
         raise UnknownTrainerError(
-            f"{script} holds no training loop, but names {names}, which no gate reaches in a process of its own: start "
-            f"skipgs-plug run ADAPTER -- {started[0]} yourself, or write skipgs-plug run ADAPTER -- in place of python "
-            f"in a copy of {script.name}."
+            f"{script} holds no training loop, but names {names}, which no gate reaches in a process of its own: run "
+            f"it with --no-gate if it does not train, start skipgs-plug run ADAPTER -- {started[0]} yourself, or write "
+            f"skipgs-plug run ADAPTER -- in place of python in a copy of {script.name}."
         )
     advice = "gate that loop"
     if code.used:
@@ -170,14 +171,20 @@ def _recognising(code: LoopCode) -> type[AbstractAdapter] | None:
 
 
 def _training_scripts_named_in(driver: Path) -> list[str]:
-    """Return the training scripts whose files a script names in its texts, as one does that starts them."""
-    texts = [node.value for node in ast.walk(ast.parse(driver.read_bytes())) if isinstance(node, ast.Constant)]
+    """Return the training scripts whose files a script names in its texts, as one does that starts them.
+
+    Docstrings are left out, because they also name scripts that came before.
+    """
+    nodes = list(ast.walk(ast.parse(driver.read_bytes())))
+    docstrings = {node.value for node in nodes if isinstance(node, ast.Expr)}
+    texts = [node.value for node in nodes if isinstance(node, ast.Constant) and node not in docstrings]
     words = {word for text in texts if isinstance(text, str) for word in SCRIPT_NAME.findall(text)}
     return sorted(word for word in words if _is_training_script(word, driver))
 
 
 def _is_training_script(word: str, driver: Path) -> bool:
-    file = next((path for path in (Path(word), driver.parent / word) if path.is_file()), None)
+    # Not Path.is_file, which raises for a folder that may not be read, and for a name that is too long.
+    file = next((path for path in (Path(word), driver.parent / word) if os.path.isfile(path)), None)
     return file is not None and not file.samefile(driver) and _adapter_of(file) is not None
 
 

@@ -131,14 +131,14 @@ def check(args: Args, checkpoints: list[Path]) -> None:
         require_lpips(args.session.lpips_net)
     if checkpoints and not args.resume:
         raise InputError(f"{args.out} already holds a run; add --resume to continue it or give another --out.")
+    if args.resume and not checkpoints:
+        raise MissingFileError(f"{args.out} holds no checkpoint (ckpts/ckpt_*_rank0.pt); start without --resume.")
     results = RunFolder(args.out).results()
     if results and not checkpoints:
         raise InputError(
             f"{args.out} holds files of a run without a checkpoint ({results[0]}), with which a new run would be "
             "mixed; give another --out, or move them away."
         )
-    if args.resume and not checkpoints:
-        raise MissingFileError(f"{args.out} holds no checkpoint (ckpts/ckpt_*_rank0.pt); start without --resume.")
     if reads_photographs and is_scene(scene):
         check_origin(scene, given)
     elif reads_photographs:

@@ -195,9 +195,10 @@ def _why_more(growing: dict[str, Any], ended: bool) -> str:
     times = growing["times_grown"]
     if growing["share"] is None or times is None or run <= 1.1 * growing["share"] * asked or times <= 1.0:
         return ""
+    early = ", or because the run ended early" if ended else ""
     return (
         f"\n  this is more than the share of {growing['share']:.2f}, because the scene grew to {times:.1f} times its "
-        f"Gaussians, or because conditions of the loop need iterations{', or because the run ended early' * ended}"
+        f"Gaussians, or because conditions of the loop need iterations{early}"
     )
 
 

@@ -40,6 +40,7 @@ BENCH_PICTURES = {
 }
 SPLITS = {"val": "held-out", "train": "training"}  # views that were evaluated, by the beginning of file names
 EVALUATIONS = "stats/{}_step*.json"
+NO_STEP = -1
 CURVE = "train_curve.json"
 CURVE_FIELDS = ("step", "seconds", "loss", "num_GS")
 
@@ -185,15 +186,16 @@ def last_evaluation(folder: Path) -> tuple[str, dict[str, Any], list[Path]]:
     """Return the last evaluation in gsplat's file layout: a key of `SPLITS`, metrics, and pictures.
 
     Metrics and pictures are empty if there is none. Training views count if no held-out ones were evaluated.
+    `train_step6999_rank0.json`, which gsplat's script writes, is no evaluation: it holds time and memory.
     """
     for beginning in SPLITS:
         found = [(step_of(path), path) for path in folder.glob(EVALUATIONS.format(beginning))]
-        if found:
-            step, path = max(found)
+        step, path = max(found, default=(NO_STEP, folder))
+        if step != NO_STEP:
             return beginning, read_object(path), sorted((folder / "renders").glob(f"{beginning}_step{step}_*.png"))
     return "val", {}, []
 
 
 def step_of(path: Path) -> int:
     digits = path.stem.partition("_step")[2]
-    return int(digits) if digits.isdigit() else -1
+    return int(digits) if digits.isdigit() else NO_STEP

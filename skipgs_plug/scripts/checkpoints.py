@@ -45,7 +45,7 @@ class Checkpoints:
         self._run = {"adapter": adapter, "script": script}
         self._search = resume == "auto"
         self._given = None if resume in ("auto", "off") else Path(resume)
-        self._found: list[Path] = []
+        self._found: list[tuple[Path, str | None]] = []  # state files, and what their checkpoints held when loaded
         self._without: list[Path] = []  # missing state files of loaded checkpoints
         if self._given is not None:
             _read(self._given)
@@ -66,7 +66,10 @@ class Checkpoints:
         def load_and_remember(f: Any, *args: Any, **kwargs: Any) -> Any:
             if self._search and (path := _path_of(f)) is not None:
                 beside = _beside(path)
-                (self._found if beside.is_file() else self._without).append(beside)
+                if beside.is_file():
+                    self._found.append((beside, _contents_of(path)))
+                else:
+                    self._without.append(beside)
             return load(f, *args, **kwargs)
 
         torch.save, torch.load = save_both, load_and_remember
@@ -92,9 +95,9 @@ class Checkpoints:
             say(f"The gate takes its state from {self._given}.")
             return content["gate"]
         refused = ""
-        for path in self._found:
+        for path, checkpoint in self._found:
             content = _read(path)
-            if content.get("checkpoint") not in (None, _contents_of(path.with_name(path.name.removesuffix(SUFFIX)))):
+            if content.get("checkpoint") not in (None, checkpoint):
                 refused = f"The gate starts afresh: {path} was saved beside another checkpoint of that name."
                 continue
             if content["gate"]["step"] == first - 1 and {name: content[name] for name in self._run} == self._run:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
+import sys
 from pathlib import Path
 
 PYTHON = re.compile(r"python(\d+(\.\d+)?)?(\.exe)?")
 SHELLS = {"bash", "sh", "zsh", "fish"}
 LAUNCHERS = {"torchrun", "accelerate", "deepspeed", "fabric"}  # they start processes, each of which needs a gate
 VARIABLE = re.compile(r"[A-Za-z_]\w*=")
-SHEBANG_LENGTH = 256  # bytes of a program's first line that Linux reads
+BEGINNING = 512  # bytes of a program that name its interpreter, also in the form for long paths, which has two lines
 
 
 def wrapper_hint(name: str) -> str | None:
@@ -21,7 +23,7 @@ def wrapper_hint(name: str) -> str | None:
             f"{name} is no script: the first word after '--' is the training script; options of skipgs-plug go before "
             "'--', and those of Python follow python, as in python -u -m skipgs_plug run ADAPTER -- train.py."
         )
-    if VARIABLE.match(name):
+    if VARIABLE.match(name) and not os.path.isfile(name):
         return f"{name} sets a variable of the environment: write it before skipgs-plug, not after '--'."
     if PYTHON.fullmatch(word.name):
         return f"Leave out {name}: write after '--' what follows it, for example -- train.py -s data."
@@ -45,10 +47,14 @@ def program_hint(name: str) -> str | None:
         return None
     try:
         with open(program, "rb") as file:
-            first_line = file.read(SHEBANG_LENGTH).partition(b"\n")[0]
+            beginning = file.read(BEGINNING)
     except OSError:  # it may be executed, but not read
-        first_line = b""
-    if first_line.startswith(b"#!") and b"python" in first_line:
+        beginning = b""
+    words = re.split(rb"[\s'\"]+", beginning) if beginning.startswith(b"#!") else []
+    interpreter = next((word.removeprefix(b"#!") for word in words if b"python" in word), None)
+    if interpreter is not None and interpreter in (os.fsencode(sys.executable), b"python", b"python3"):
+        return f"{name} is a Python script on the PATH: give its path, {program}."
+    if interpreter is not None:
         return (
             f"{program} belongs to another Python than the one that runs skipgs-plug: install skipgs-plug there too, "
             "and run it from there."

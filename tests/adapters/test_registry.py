@@ -103,3 +103,29 @@ def test_a_script_that_starts_training_scripts_is_told_to_name_them(tmp_path, mo
         registry.find_script_adapter(own)
     with pytest.raises(UnknownTrainerError, match=r"which has no function training\(\), but render_sets: run it"):
         registry.find_script_adapter(tmp_path / "render.py")
+
+
+def test_a_script_that_only_mentions_training_is_not_told_to_start_it(tmp_path) -> None:
+    (tmp_path / "train.py").write_text("def training(opt):\n    GaussianModel()\n    loss.backward()\n")
+    script = tmp_path / "evaluate.py"
+    script.write_text('"""Run python train.py before."""\ndef metrics():\n    "As train.py saved it."\n')
+    with pytest.raises(UnknownTrainerError, match=r"no function training\(\), but metrics: run it with --no-gate"):
+        registry.find_script_adapter(script)
+
+
+@pytest.mark.parametrize("text", [f"{'x' * 300}.py", "x" * 10**6, "a\0b.py"], ids=["long name", "long text", "null"])
+def test_any_text_in_a_script_is_no_reason_to_fail(text, tmp_path) -> None:
+    script = tmp_path / "drive.py"
+    script.write_text(f"BLOB = {text!r}\n")
+    with pytest.raises(UnknownTrainerError, match="which has no function at all"):
+        registry.find_script_adapter(script)
+
+
+def test_a_script_that_may_not_be_read_is_not_one_that_is_started(tmp_path, monkeypatch) -> None:
+    def closed(path, *args, **kwargs):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    script = tmp_path / "drive.py"
+    script.write_text("TRAINS = '/closed/train.py'\n")
+    monkeypatch.setattr("os.stat", closed)  # as for a folder of another user
+    assert registry._training_scripts_named_in(script) == []

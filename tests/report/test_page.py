@@ -9,9 +9,11 @@ import pytest
 from browser import Browser
 from report_browser import body_count
 
+from skipgs_plug import SkipGSError
 from skipgs_plug.cli import main
 from skipgs_plug.report.phases import phases
 from skipgs_plug.report.plots import inline_svg, loss_over_time
+from skipgs_plug.report.source import read_source
 from skipgs_plug.trainer import TrainConfig, Trainer, load_scene, save_packed
 from skipgs_plug.trainer.curve import LossCurve
 
@@ -300,3 +302,12 @@ def test_a_phase_that_runs_whole_is_told_too():
     growing, refining = phases(gate, curve)
     assert (growing.run, growing.left_out, growing.gaussians, growing.without) == (100, 0, 20, 2.0)
     assert (refining.iterations, refining.gaussians, refining.without) == (100, 30, 2.5)
+
+
+def test_statistics_of_training_are_no_evaluation(tmp_path):
+    """gsplat's script writes time and memory to `train_step*_rank0.json`, also in a run that is never evaluated."""
+    (tmp_path / "stats").mkdir()
+    for step in (6999, 29999):
+        (tmp_path / f"stats/train_step{step}_rank0.json").write_text('{"mem": 1.0, "num_GS": 3}')
+    with pytest.raises(SkipGSError, match=r"holds neither skipgs\.json, bench\.json nor stats/val_step"):
+        read_source(tmp_path)

@@ -196,6 +196,30 @@ def test_a_command_of_another_python_is_named(tmp_path, monkeypatch):
         run_script(["train-elsewhere", "--data", "garden"])
 
 
+@pytest.mark.parametrize(
+    ("beginning", "sentence"),
+    [
+        (f"#!{sys.executable}", "is a Python script on the PATH: give its path"),
+        ("#!/usr/bin/env python3", "is a Python script on the PATH: give its path"),
+        ("#!/bin/sh\n'''exec' '/elsewhere/long path/bin/python' \"$0\" \"$@\"", "belongs to another Python"),
+        ("#!/bin/sh", "is a program, and no Python script"),
+    ],
+)
+def test_what_runs_a_program_is_read_from_its_beginning(beginning, sentence, tmp_path, monkeypatch):
+    (tmp_path / "train-it").write_text(f"{beginning}\nimport trainer\n")
+    (tmp_path / "train-it").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(SkipGSError, match=sentence):
+        run_script(["train-it"])
+
+
+def test_a_script_whose_path_looks_like_a_variable_runs(tmp_path, monkeypatch):
+    (tmp_path / "lr=1").mkdir()
+    (tmp_path / "lr=1/train.py").write_text("print('trained')")
+    monkeypatch.chdir(tmp_path)
+    assert source_of(["lr=1/train.py"]) == tmp_path / "lr=1/train.py"
+
+
 def test_the_source_of_a_module_is_found_without_importing_its_packages(checkout, monkeypatch):
     package = checkout / "package_of_script" / "inner"
     package.mkdir(parents=True)

@@ -29,6 +29,6 @@ def pace_of(config: SkipConfig, rates: ScaledRates, go_on: Callable[[int], None]
         idle = [name for name in OF_PAPERS_GATE if getattr(config, name) != getattr(usual, name)]
         if idle:
             listed = ", ".join(idle)
-            caution(f"Only the paper's gate uses these settings, and share and refine_share do not: {listed}.", 5)
+            caution(f"Leave out {listed}: only the paper's gate uses such settings, share and refine_share do not.", 5)
         return Phased(config, rates, go_on, release)
     return Compensated(config, rates) if config.compensates else Pace()

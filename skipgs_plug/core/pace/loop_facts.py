@@ -170,13 +170,15 @@ class LoopFacts:
         }
 
     def load_state_dict(self, state: dict[str, Any], configured: bool) -> None:
-        """Continue from `state_dict()`; if the trainer has told its facts, only check when its densification ends.
+        """Continue from `state_dict()`; if the trainer has told its facts, only compare the schedule.
 
         Raises:
-            GateStateError: It ends elsewhere.
+            GateStateError: Densification, or the run, ends elsewhere.
         """
         if configured:
             require_same_schedule(state, self.start, None)
+            if self.last is None:  # in a loop of the user's own, which is compared when it begins
+                self._saved, self.last = state, state["last"]
             return
         self._saved = state
         self.start, self.last, self._accumulates = state["start"], state["last"], state["keeps_rates"]
@@ -195,13 +197,14 @@ def require_same_schedule(state: Mapping[str, Any], start: int, last: int | None
     Raises:
         GateStateError: It was not.
     """
-    told = ""
-    if start != state["start"] > (state.get("next") or 0):
-        told = f"whose refinement begins at iteration {state['start']:,}, not {start:,}"
-    elif None not in (last, state["last"]) and last != state["last"]:
-        told = f"that ends with iteration {state['last']:,}, not {last:,}"
-    if told:
+    saved_start, saved_last, refines = state["start"], state["last"], (state.get("next") or 0) >= state["start"]
+    difference = ""
+    if start != saved_start and not refines:
+        difference = f"whose refinement begins at iteration {saved_start:,}, not {start:,}"
+    elif last is not None and saved_last is not None and last != saved_last:
+        difference = f"that ends with iteration {saved_last:,}, not {last:,}"
+    if difference:
         raise GateStateError(
-            f"The gate state was saved in a run {told}; continue with the schedule of that run, or start the gate "
-            "afresh."
+            f"The gate state was saved in a run {difference}; continue with the schedule of that run, or start the "
+            "gate afresh."
         )

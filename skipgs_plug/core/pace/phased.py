@@ -283,13 +283,13 @@ class Phased(Pace):
         growing = state["growing"]
         if _asked_in(state) != (self._config.growing, self._config.refining):
             raise other_shares(state, self._config)
+        # First, since it can refuse the state. The loop asks about its first number before the trainer tells its facts.
+        self._facts.load_state_dict(state, self._configured)
         self._facts.required = set(state["required"])
         self.refining.load_state_dict(state["refining"])
         if growing is not None:
             self.growing.load_state_dict(growing)
         self._finder.expected = state["next"]
-        # The loop asks about its first number before the trainer reports its facts.
-        self._facts.load_state_dict(state, self._configured)
         self._configured = True
         if self._planned is not None:
             self._read(self._planned, max(self._facts.start, state["next"] or 0))

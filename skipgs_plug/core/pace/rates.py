@@ -60,7 +60,8 @@ def path_factor(
         progress: Share of refinement that is over, in [0, 1].
         peak: Factor at the beginning, in place of the formula.
         visible: Share of the Gaussians that a view shows, in (0, 1]; None if it is not known.
-        steps: Number of steps of refinement; None if they are as many as in the trainer's own run.
+        steps: Number of steps of refinement; None if they are as many as in the trainer's own run, or if its optimizers
+            accumulate gradients.
     """
     if peak is None:
         peak = 2.0 * math.sqrt(3.0 * (VISIBLE if visible is None else visible)) / max(share, LEAST_PATH_SHARE)

@@ -1,6 +1,8 @@
 """`skipgs-plug run`: the state of the gate beside the script's checkpoints, and the report."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import torch
@@ -8,6 +10,7 @@ from inria_checkout import counted
 
 from skipgs_plug import SkipGSError, cli
 from skipgs_plug.core.policy import SkipPolicy
+from skipgs_plug.scripts.checkpoints import Checkpoints
 
 
 def test_gate_goes_on_with_the_scripts_own_checkpoint(train, capfd):
@@ -141,6 +144,29 @@ def test_a_state_beside_a_later_checkpoint_of_another_run_is_not_used(train, cap
     state = folder / "chkpnt40.pth.skipgs.json"
     sentence = f"The gate starts afresh: {state} was saved beside another checkpoint of that name."
     assert code == 0 and sentence in capfd.readouterr().err and counted(resumed)["iterations"] == 20
+
+
+@pytest.mark.parametrize("then", ["saved again", "moved away"])
+def test_a_state_belongs_to_the_checkpoint_that_was_loaded(then, tmp_path):
+    """Some scripts replace or remove their checkpoint after they have read it."""
+    path, run = tmp_path / "latest.pth", ("inria", "train.py")
+    saved = Checkpoints(*run)
+    saved.gate = cast(
+        "Any",
+        SimpleNamespace(
+            config=SimpleNamespace(enabled=True), stats=lambda: {"iterations": 10}, state_dict=lambda: {"step": 10}
+        ),
+    )
+    with saved.watch():
+        torch.save({"step": 10}, path)
+    resumed = Checkpoints(*run)
+    with resumed.watch():
+        torch.load(path)
+        if then == "saved again":
+            torch.save({"step": 10, "resumed": True}, path)
+        else:
+            path.rename(tmp_path / "older.pth")
+        assert resumed.state_for(11) == {"step": 10}
 
 
 @pytest.mark.parametrize(

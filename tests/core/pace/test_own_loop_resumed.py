@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -118,6 +119,30 @@ def test_a_state_of_another_schedule_is_refused():
         gate.load_state_dict(states[5])
     with SkipGate(start_iter=12, refine_share=0.4) as gate:
         gate.load_state_dict(states[-1])  # refinement has begun
+
+
+def test_a_refused_state_changes_nothing():
+    with SkipGate(start_iter=10, refine_share=0.4) as gate:
+        states = [*first_part(Loop(), gate, 15, {})]
+    with SkipGate(start_iter=20, refine_share=0.4) as gate:
+        before = gate.state_dict()["pace"]
+        with pytest.raises(SkipGSError, match="whose refinement begins at iteration 10"):
+            gate.load_state_dict(states[5])
+        assert gate.state_dict()["pace"] == before
+
+
+def test_a_loop_that_goes_on_with_more_iterations_is_refused():
+    with SkipGate(start_iter=10, refine_share=0.4) as gate:
+        for step in gate.iterations(range(40), always=()):
+            gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
+            if step == 15:
+                state = gate.state_dict()
+    for numbers, refused in ((range(16, 40), False), (range(16, 400), True)):
+        with SkipGate(start_iter=10, refine_share=0.4) as gate:
+            gate.load_state_dict(state)
+            expected = pytest.raises(SkipGSError, match="ends with iteration 39, not 399") if refused else nullcontext()
+            with expected:
+                next(iter(gate.iterations(numbers, always=())))
 
 
 def test_a_state_with_larger_steps_does_not_go_on_without():
