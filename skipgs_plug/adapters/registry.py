@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from skipgs_plug.adapters.base import AbstractAdapter
-from skipgs_plug.adapters.loop_code import LoopCode
+from skipgs_plug.adapters.loop_code import LOOP, LoopCode
 from skipgs_plug.core.errors import AdapterMismatchError, SkipGSError, UnknownTrainerError
 
 # In the order in which they are tried: a fork stands before its parent. Modules are imported when they are tried.
@@ -153,6 +153,9 @@ def find_script_adapter(script: Path) -> type[AbstractAdapter]:
         found = f"no function training(), but calls backward in {_listed(code.backward)}"
     elif code.calls_backward:
         found = "no function training(), but calls backward itself"
+    elif LOOP in code.functions:
+        found = f"a function {LOOP}() without a training loop"
+        advice = "run it with --no-gate if it does not train, name the script that holds the loop, gate that loop"
     else:
         functions = [name for name in code.functions if not name.startswith("_")]
         found = f"no function training(), but {_listed(functions)}" if functions else "no function at all"

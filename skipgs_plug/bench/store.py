@@ -9,6 +9,7 @@ from typing import Any
 from skipgs_plug.bench.record import RunRecord
 from skipgs_plug.trainer import InputError
 from skipgs_plug.trainer.files import write_aside, write_json
+from skipgs_plug.trainer.run_folder import BENCH_SETTINGS, RunFolder
 
 
 class BenchFolder:
@@ -23,10 +24,15 @@ class BenchFolder:
         Seeds and policies do not count as settings: a folder may get more of them later.
 
         Raises:
-            InputError: The folder holds a bench with other settings. The message names the first difference.
+            InputError: The folder holds a training run, or a bench with other settings. The message names a file, or
+                the first difference.
         """
-        path = self.root / "settings.json"
+        path = self.root / BENCH_SETTINGS
         if not path.is_file():
+            run = RunFolder(self.root)
+            files = [*run.checkpoints(), *run.results()]
+            if files:
+                raise InputError(f"{self.root} holds a training run ({files[0]}), not a bench; give another --out.")
             write_json(path, settings)
             return
         stored = read_json(path)

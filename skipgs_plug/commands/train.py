@@ -31,7 +31,7 @@ from skipgs_plug.trainer.lock import exclusive
 from skipgs_plug.trainer.metrics import require_lpips
 from skipgs_plug.trainer.ply import read_start
 from skipgs_plug.trainer.resume import first_sound, lengths
-from skipgs_plug.trainer.run_folder import SCENE, RunFolder
+from skipgs_plug.trainer.run_folder import BENCH_SETTINGS, SCENE, RunFolder
 from skipgs_plug.trainer.scene import all_held_out
 from skipgs_plug.view.spz import to_spz
 
@@ -133,6 +133,8 @@ def check(args: Args, checkpoints: list[Path]) -> None:
         raise InputError(f"{args.out} already holds a run; add --resume to continue it or give another --out.")
     if args.resume and not checkpoints:
         raise MissingFileError(f"{args.out} holds no checkpoint (ckpts/ckpt_*_rank0.pt); start without --resume.")
+    if (Path(args.out).expanduser() / BENCH_SETTINGS).is_file():
+        raise InputError(f"{args.out} holds a bench, with which a run would be mixed; give another --out.")
     results = RunFolder(args.out).results()
     if results and not checkpoints:
         raise InputError(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import operator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import torch
@@ -70,6 +71,10 @@ class OwnLoop:
             raise SkipGSError(f"views= takes a list of all names of training views, not the one name {views!r}.")
         if resets is not None and events is None:
             raise SkipGSError("resets= is for loops whose densification events are known: give events=, too.")
+        if views is not None and not isinstance(views, Iterable):
+            raise SkipGSError(f"views= takes a list of all names of training views, not {views!r}.")
+        for name, given in {"always": always, "events": events, "resets": resets}.items():
+            _require_iterations(name, given)
         with self.guarded:
             keys = list(dict.fromkeys(view_key(view) for view in (() if views is None else views))) or None
             pace, on_error = self._engine.pace, self._release.on_error
@@ -234,6 +239,20 @@ def _is_index_on_device(view: Tensor) -> bool:
 
 def _backward_of_sum(losses: Iterable[Tensor]) -> None:
     torch.stack(list(losses)).sum().backward()
+
+
+def _require_iterations(name: str, given: Any) -> None:
+    """Raise SkipGSError unless an argument holds iterations. A generator is not read, since that works only once."""
+    if given is None or isinstance(given, Iterator):
+        return
+    example = f"{name}= takes iterations, such as range(600, 15_000, 100)"
+    if not isinstance(given, Iterable) or isinstance(given, (str, bytes)):
+        raise SkipGSError(f"{example}, not {given!r}.")
+    for number in given:
+        try:
+            operator.index(number)
+        except TypeError:
+            raise SkipGSError(f"{example}, and no {number!r} among them.") from None
 
 
 def _among(numbers: Iterable[int]) -> Callable[[range], Iterable[int]]:

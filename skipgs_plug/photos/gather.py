@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -24,6 +26,7 @@ UNREADABLE = (".heic", ".heif", ".dng", ".cr2", ".nef", ".arw")
 MODEL, FOCAL_LENGTH, EXIF_BLOCK = 0x0110, 0x920A, 0x8769  # EXIF tags
 QUALITY: dict[str, Any] = {"quality": 97, "subsampling": 0}  # options of Pillow for JPEG files
 OPAQUE = 128  # least alpha, of 255, of a pixel that is not masked; the same as in the loaders
+REDUCED = re.compile(r"(.+)_\d+(?:_png)?")  # name of a folder of reduced photographs, as Mip-NeRF 360 and gsplat have
 LEAST = 3  # least number of photographs; fewer cannot be reconstructed
 
 
@@ -55,11 +58,29 @@ def are_photographs(source: Path) -> bool:
 
 
 def photographs(folder: Path) -> Iterator[Path]:
-    """Yield the photographs in a folder and its subfolders, also those in formats that cannot be read."""
+    """Yield the photographs in a folder and its subfolders, also those in formats that cannot be read.
+
+    Reduced copies are left out; see `is_of_copies`.
+    """
     known = AS_THEY_ARE + CONVERTED + UNREADABLE
+    of_copies = functools.cache(is_of_copies)
     for path in walk(folder):
-        if path.suffix.lower() in known and not path.name.startswith(".") and not path.is_dir():
+        if path.suffix.lower() not in known or path.name.startswith(".") or path.is_dir():
+            continue
+        if path.parent == folder or not of_copies(path.parent):
             yield path
+
+
+def is_of_copies(folder: Path) -> bool:
+    """Return whether a folder such as `images_4` holds reduced copies of the photographs in `images` beside it.
+
+    With them each photograph would count twice, and held-out views would be trained on.
+    """
+    match = REDUCED.fullmatch(folder.name)
+    whole = None if match is None else folder.with_name(match[1])
+    if whole is None or not whole.is_dir():
+        return False
+    return {path.stem for path in folder.iterdir()} <= {path.stem for path in whole.iterdir()}
 
 
 def walk(folder: Path) -> Iterator[Path]:

@@ -142,6 +142,7 @@ def save_checkpoint(trainer: Capturable, path: str | Path) -> None:
             "name": trainer.scene.name,
             "view_names": list(trainer.view_names),
             "viewmats": _viewmats(trainer.scene),
+            "sizes": _sizes(trainer.scene),
             **trainer.scene.frame.as_dict(),
         },
     }
@@ -256,6 +257,7 @@ def _require_same_run(trainer: Capturable, content: dict[str, Any], path: str | 
     if content["scene"]["view_names"] != list(trainer.view_names):
         raise InputError(f"Checkpoint {path} was made with other training views; resume with its own scene and split.")
     _require_same_cameras(trainer.scene, content["scene"], path)
+    _require_same_sizes(trainer.scene, content["scene"], path)
     # A checkpoint that is older than a setting was made with the present default.
     made_with = {field.name: field.default for field in dataclasses.fields(TrainConfig)} | content["config"]
     for name, value in dataclasses.asdict(trainer.config).items():
@@ -327,6 +329,24 @@ def _require_same_cameras(scene: Scene, saved: Mapping[str, Any], path: str | Pa
             f"Checkpoint {path} was trained with other poses of {len(changed)} of its {len(own)} cameras, such as "
             f"{scene.train[changed[0]].name!r}; resume with the reconstruction it was begun with, or start afresh."
         )
+
+
+def _require_same_sizes(scene: Scene, saved: Mapping[str, Any], path: str | Path) -> None:
+    """Raise InputError if the checkpoint was trained with photographs of other sizes. Up to 0.2.0 it does not tell."""
+    if "sizes" not in saved:
+        return
+    for before, now, view in zip(saved["sizes"], _sizes(scene), scene.train, strict=True):
+        if list(before) != now:
+            raise InputError(
+                f"Checkpoint {path} was trained with photographs of another size: {view.name!r} had "
+                f"{before[0]}x{before[1]} pixels, and has {now[0]}x{now[1]}; resume with the photographs it was begun "
+                "with, or start afresh."
+            )
+
+
+def _sizes(scene: Scene) -> list[list[int]]:
+    """Return width and height of the training views, in pixels."""
+    return [[view.width, view.height] for view in scene.train]
 
 
 def _viewmats(scene: Scene) -> Tensor:

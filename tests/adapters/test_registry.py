@@ -129,3 +129,10 @@ def test_a_script_that_may_not_be_read_is_not_one_that_is_started(tmp_path, monk
     script.write_text("TRAINS = '/closed/train.py'\n")
     monkeypatch.setattr("os.stat", closed)  # as for a folder of another user
     assert registry._training_scripts_named_in(script) == []
+
+
+def test_a_training_function_without_a_loop_is_not_said_to_be_missing(tmp_path) -> None:
+    script = tmp_path / "train.py"
+    script.write_text("def training(opt): pass\n")
+    with pytest.raises(UnknownTrainerError, match=r"which has a function training\(\) without a training loop: run it"):
+        registry.find_script_adapter(script)

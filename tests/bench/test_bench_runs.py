@@ -255,6 +255,13 @@ def test_other_settings_in_the_same_folder_are_refused(scene, finished):
         make_bench(scene, finished.folder, max_steps=90)
 
 
+def test_the_folder_of_a_training_run_is_refused(scene, tmp_path):
+    (tmp_path / "skipgs.json").write_text("{}")
+    with pytest.raises(InputError, match=r"holds a training run \(.*skipgs.json\), not a bench; give another --out"):
+        make_bench(scene, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["skipgs.json"]
+
+
 def test_more_seeds_may_be_added_to_a_folder(scene, finished):
     make_bench(scene, finished.folder, seeds=(0, 1, 2))
 

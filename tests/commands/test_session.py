@@ -222,6 +222,9 @@ def test_a_run_is_not_mixed_with_an_older_one(
         assert "files of a run without a checkpoint" in capsys.readouterr().err
         shutil.rmtree(out / removed)
     (out / "skipgs.json").unlink()
+    (out / "settings.json").write_text("{}")
+    assert train(packed, out) == 2 and "holds a bench, with which a run would be mixed" in capsys.readouterr().err
+    (out / "settings.json").unlink()
     assert train(packed, out, "--max-steps", "4") == 0
 
 

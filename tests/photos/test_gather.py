@@ -186,3 +186,18 @@ def test_a_video_that_was_held_upright(pattern, tmp_path, turn):
     for frame in taken:
         assert frame.shape == upright.shape
         assert np.abs(frame - upright).mean() < 25
+
+
+def test_reduced_copies_are_left_out(pattern, tmp_path):
+    """Folders of Mip-NeRF 360 and LLFF hold each photograph in several sizes."""
+    for name in ("images", "images_4", "images_8_png", "evening_2", "walk_2"):
+        (tmp_path / name).mkdir()
+    for number in range(4):
+        for file in (f"images/{number}.jpg", f"images_4/{number}.jpg", f"images_8_png/{number}.png"):
+            Image.fromarray(pattern).save(tmp_path / file)
+    (tmp_path / "walk").mkdir()
+    Image.fromarray(pattern).save(tmp_path / "walk/a.jpg")
+    Image.fromarray(pattern).save(tmp_path / "walk_2/b.jpg")  # another walk
+    Image.fromarray(pattern).save(tmp_path / "evening_2/c.jpg")  # there is no folder `evening`
+    names = gather(tmp_path, tmp_path.with_name("gathered"), 10, lambda n: None).names
+    assert names == ["evening_2/c.jpg", *(f"images/{n}.jpg" for n in range(4)), "walk/a.jpg", "walk_2/b.jpg"]

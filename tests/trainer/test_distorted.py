@@ -187,6 +187,7 @@ def test_nerfstudio_pinhole_by_angle_split_and_factor(tmp_path: Path) -> None:
         ({"k4": 0.1}, r"camera_model 'OPENCV' with k4 is not supported"),
         ({"fl_x": None, "fl_y": None}, r"has neither fl_x nor camera_angle_x"),
         ({"fl_x": -5}, r"has a focal length of -5"),
+        ({"fl_x": 0}, r"focal length of 0"),
         ({"fl_x": "wide"}, r"fl_x is 'wide', not a finite number"),
         ({"w": 0}, r"w and h are 0 and 90"),
         ({"w": 90}, r"but its camera is 90x90"),

@@ -262,3 +262,15 @@ def test_a_checkpoint_in_coordinates_of_the_dataset_goes_on(tmp_path: Path, tiny
     torch.save(content, tmp_path / "before.pt")
     with pytest.raises(InputError, match="other poses of 8 of its 8 cameras"):
         Trainer(begun.config, scene).load_checkpoint(tmp_path / "before.pt")
+
+
+def test_photographs_of_another_size_do_not_go_on(tiny_scene, tmp_path):
+    begun = trained(tiny_scene)
+    begun.save_checkpoint(tmp_path / "now.pt")
+    content = torch.load(tmp_path / "now.pt", weights_only=True)
+    width, height = content["scene"]["sizes"][2]
+    content["scene"]["sizes"][2] = [2 * width, 2 * height]
+    torch.save(content, tmp_path / "before.pt")
+    sentence = rf"another size: 'view_\d+.png' had {2 * width}x{2 * height} pixels, and has {width}x{height}; resume"
+    with pytest.raises(InputError, match=sentence):
+        Trainer(begun.config, tiny_scene).load_checkpoint(tmp_path / "before.pt")

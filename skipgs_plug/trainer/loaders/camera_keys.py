@@ -75,7 +75,12 @@ def read_camera(values: dict[str, Any], image_path: Path, source: Path) -> Any:
             f"{source}: {image_path.name} has neither fl_x nor camera_angle_x nor x_fov, nor these of y; "
             "run ns-process-data again."
         )
-    pinhole = [focal_x or focal_y, focal_y or focal_x, numbers.get("cx", width / 2), numbers.get("cy", height / 2)]
+    pinhole = [
+        focal_y if focal_x is None else focal_x,
+        focal_x if focal_y is None else focal_y,
+        numbers.get("cx", width / 2),
+        numbers.get("cy", height / 2),
+    ]
     k1, k2, k3, k4, p1, p2 = (numbers.get(name, 0.0) for name in DISTORTION)
     kind = values.get("camera_model", "PERSPECTIVE")
     if values.get("is_fisheye") and kind in PERSPECTIVE:

@@ -273,3 +273,17 @@ def test_a_loop_can_stand_in_the_script_itself(tmp_path):
     names = runpy.run_path(str(script), run_name="__main__")
     assert names["evaluated"] == [0, 30, 60, 90] and len(names["ran"]) < 70
     names["gate"].detach()
+
+
+@pytest.mark.parametrize("name", ["always", "events", "resets"])
+@pytest.mark.parametrize("given", [100, "100", [100.5], ["a"]])
+def test_what_is_no_iterations_is_refused_before_training(name, given):
+    arguments = {"events": [5], name: given}
+    with SkipGate(start_iter=10, share=0.5) as gate:
+        with pytest.raises(
+            SkipGSError, match=rf"{name}= takes iterations, such as range\(600, 15_000, 100\), (not|and)"
+        ):
+            gate.iterations(range(40), **arguments)
+        with pytest.raises(SkipGSError, match="views= takes a list of all names of training views, not 10"):
+            gate.iterations(range(40), views=10)
+        assert gate.iterations(range(40), **{"events": [5], name: iter([20])})
