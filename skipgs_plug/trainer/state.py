@@ -335,18 +335,22 @@ def _require_same_sizes(scene: Scene, saved: Mapping[str, Any], path: str | Path
     """Raise InputError if the checkpoint was trained with photographs of other sizes. Up to 0.2.0 it does not tell."""
     if "sizes" not in saved:
         return
-    for before, now, view in zip(saved["sizes"], _sizes(scene), scene.train, strict=True):
-        if list(before) != now:
-            raise InputError(
-                f"Checkpoint {path} was trained with photographs of another size: {view.name!r} had "
-                f"{before[0]}x{before[1]} pixels, and has {now[0]}x{now[1]}; resume with the photographs it was begun "
-                "with, or start afresh."
-            )
+    sizes, own = saved["sizes"], _sizes(scene)
+    if not isinstance(sizes, Tensor) or sizes.shape != own.shape:
+        raise DamagedCheckpointError(f"Checkpoint {path} is damaged (its sizes have another shape); use an older one.")
+    changed = (sizes.cpu() != own).any(dim=1).nonzero()[:, 0].tolist()
+    if changed:
+        (width, height), (own_width, own_height) = sizes[changed[0]].tolist(), own[changed[0]].tolist()
+        raise InputError(
+            f"Checkpoint {path} was trained with photographs of another size: {scene.train[changed[0]].name!r} had "
+            f"{width}x{height} pixels, and has {own_width}x{own_height}; resume with those it was begun with, "
+            "or start afresh."
+        )
 
 
-def _sizes(scene: Scene) -> list[list[int]]:
-    """Return width and height of the training views, in pixels."""
-    return [[view.width, view.height] for view in scene.train]
+def _sizes(scene: Scene) -> Tensor:
+    """Return width and height [C, 2] of the training views, in pixels."""
+    return torch.tensor([[view.width, view.height] for view in scene.train])
 
 
 def _viewmats(scene: Scene) -> Tensor:

@@ -268,8 +268,8 @@ def test_photographs_of_another_size_do_not_go_on(tiny_scene, tmp_path):
     begun = trained(tiny_scene)
     begun.save_checkpoint(tmp_path / "now.pt")
     content = torch.load(tmp_path / "now.pt", weights_only=True)
-    width, height = content["scene"]["sizes"][2]
-    content["scene"]["sizes"][2] = [2 * width, 2 * height]
+    width, height = content["scene"]["sizes"][2].tolist()
+    content["scene"]["sizes"][2] *= 2
     torch.save(content, tmp_path / "before.pt")
     sentence = rf"another size: 'view_\d+.png' had {2 * width}x{2 * height} pixels, and has {width}x{height}; resume"
     with pytest.raises(InputError, match=sentence):
