@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from skipgs_plug.commands.options.report import Args
@@ -17,6 +18,8 @@ def run(args: Args) -> int:
     """Build and write the page; see `Args`."""
     if not args.runs:
         raise SkipGSError("report needs at least one run folder.")
+    if args.out.endswith(os.sep):
+        raise SkipGSError(f"--out {args.out} is a folder; give the name of a page, such as {args.out}report.html.")
     suffix = Path(args.out).suffix
     if suffix.lower() not in ("", *SUFFIXES):
         raise SkipGSError(f"--out {args.out}: a page is HTML, not {suffix}; give a name that ends in .html.")

@@ -113,6 +113,8 @@ class SkipConfig:
             raise SkipGSError(f"tolerance must be a number of decibels >= 0, not {self.tolerance!r}.")
         if self.rate_peak is not None and not (_is_number(self.rate_peak) and self.rate_peak > 0.0):
             raise SkipGSError(f"rate_peak must be a factor above 0, not {self.rate_peak!r}.")
+        if self.rate_peak is not None and self.compensate is False:
+            raise SkipGSError("rate_peak is a factor of larger steps, which compensate=False turns off; leave one out.")
 
     @property
     def growing(self) -> float | str | None:

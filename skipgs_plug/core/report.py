@@ -128,7 +128,7 @@ def _summarise_refinement(config: SkipConfig, counted: dict[str, Any]) -> str:
     if counted["non_finite"]:
         backward = "ran all the same" if config.on_nonfinite == "pass" else "was skipped"
         lines.append(f"  in {counted['non_finite']:,} of them the loss was not finite, and the backward {backward}")
-    if counted["gaussians_shown"] is not None:
+    if counted["gaussians_shown"] is not None and config.compensates:
         lines.append(
             f"  each view shows {100 * counted['gaussians_shown']:.0f} % of the Gaussians; this share sets the "
             "length of the steps"

@@ -204,6 +204,9 @@ def test_a_page_under_the_name_of_another_format_is_refused(script_folder, tmp_p
     assert main(["report", str(script_folder), "--out", str(tmp_path / "page.pdf")]) == 2
     assert "a page is HTML, not .pdf; give a name that ends in .html" in capsys.readouterr().err
     assert not (tmp_path / "page.pdf").exists()
+    assert main(["report", str(script_folder), "--out", f"{tmp_path}/pages/"]) == 2
+    assert "is a folder; give the name of a page, such as" in capsys.readouterr().err
+    assert not (tmp_path / "pages").exists()
 
 
 def test_folders_without_a_run_are_named(tmp_path, capsys):

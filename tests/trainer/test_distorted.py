@@ -190,6 +190,10 @@ def test_nerfstudio_pinhole_by_angle_split_and_factor(tmp_path: Path) -> None:
         ({"fl_x": 0}, r"focal length of 0"),
         ({"fl_x": "wide"}, r"fl_x is 'wide', not a finite number"),
         ({"w": 0}, r"w and h are 0 and 90"),
+        (
+            {"w": None, "h": None, "cx": 500.0},
+            r"cx and cy lie outside frame_.* and w and h are missing; add the w and h",
+        ),
         ({"w": 90}, r"but its camera is 90x90"),
         ({"frames": []}, r"lists no frames"),
         ({"ply_file_path": "../x.ply"}, r"leaves the scene"),

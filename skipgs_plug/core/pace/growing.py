@@ -184,6 +184,12 @@ class Growing(Phase):
         events = plan.events
         assert self.share is not None
         events.rows = distributed.largest(self._rates.rows)  # ranks leave out the same events
+        bound = self._config.max_gaussians
+        if not self._rows_at_first and bound is not None and events.rows > bound:
+            caution(
+                f"The scene has {events.rows:,} Gaussians before it grows, more than max_gaussians={bound}: it will "
+                "not grow, and the gate removes none."
+            )
         self._rows_at_first = self._rows_at_first or events.rows
         if self._grows_strongly:  # new Gaussians are small by now, and half the size cost bonsai .0014 SSIM
             self.half_size.end(number)

@@ -63,7 +63,13 @@ def read_camera(values: dict[str, Any], image_path: Path, source: Path) -> Any:
     numbers = {name: read_number(values[name], name, source) for name in NUMBERS if values.get(name) is not None}
     if not {"w", "h"} <= numbers.keys():
         pixels, _ = read_image(image_path, image_path)
-        numbers["h"], numbers["w"] = pixels.shape[:2]
+        rows, columns = pixels.shape[:2]
+        numbers["h"], numbers["w"] = rows, columns
+        if numbers.get("cx", 0) >= columns or numbers.get("cy", 0) >= rows:  # they were given for larger photographs
+            raise InputError(
+                f"{source}: cx and cy lie outside {image_path.name} ({columns}x{rows} pixels), and w and h are "
+                "missing; add the w and h for which fl_x and cx were given."
+            )
     width, height = numbers["w"], numbers["h"]
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width == int(width) and height == int(height)):
         raise InputError(

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from skipgs_plug import SkipGate, SkipGSError
+from skipgs_plug.core.caution import GateWarning
 from skipgs_plug.core.pace import needs
 from skipgs_plug.core.pace.densification_events import LEAST_EVENTS
 from skipgs_plug.core.pace.needs import for_new_gaussians, growing_factor
@@ -224,7 +225,8 @@ def test_off_is_bit_identical():
 def test_events_stop_before_the_bound_on_gaussians():
     with SkipGate(start_iter=START, share=0.25, max_gaussians=6) as gate:
         assert set(Loop().train(gate).grown)
-    with SkipGate(start_iter=START, share=0.25, max_gaussians=5) as gate:
+    beyond = pytest.warns(GateWarning, match="has 6 Gaussians before it grows, more than max_gaussians=5: it will not")
+    with SkipGate(start_iter=START, share=0.25, max_gaussians=5) as gate, beyond:
         assert all(
             event % 60 == 0 for event in Loop().train(gate).grown
         )  # iterations that must run densify all the same
@@ -344,3 +346,10 @@ def test_a_run_that_ends_while_the_scene_grows_says_so():
     with SkipGate(start_iter=3000, share="auto") as gate:
         Multiplies(0.1).train(gate, until=500)
     assert "conditions of the loop need iterations, or because the run ended early" in gate.summary()
+
+
+@pytest.mark.parametrize("compensate", [True, False])
+def test_the_length_of_steps_is_told_only_where_they_are_longer(compensate):
+    with SkipGate(start_iter=START, share=0.25, compensate=compensate) as gate:
+        Loop().train(gate)
+    assert ("each view shows 100 % of the Gaussians" in gate.summary()) == compensate

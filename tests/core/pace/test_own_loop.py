@@ -220,6 +220,7 @@ def test_unfit_numbers_and_settings_are_refused():
         ({"refine_share": "half"}, "not 'half'"),
         ({"tolerance": -1.0}, "tolerance must be a number of decibels"),
         ({"rate_peak": 0.0}, "rate_peak must be a factor above 0"),
+        ({"rate_peak": 2.0, "compensate": False}, "larger steps, which compensate=False turns off"),
     ]:
         with pytest.raises(SkipGSError, match=sentence):
             SkipGate(start_iter=1, **settings)
