@@ -176,9 +176,8 @@ def names_around(caller: types.FrameType) -> Mapping[str, Any]:
 def asks_for_random_points(names: Mapping[str, Any]) -> bool | None:
     """Return whether the options of a loop ask for random points, as `--init_type random` of 3DGS-MCMC does.
 
-    The answer is None if there is no such option.
-
-    Only the loop's own variables count: a script has objects with the defaults of all options, too.
+    The answer is None if there is no such option. Only the loop's own variables count: a script has objects with the
+    defaults of all options, too.
     """
     given = (getattr(names.get(name), "init_type", None) for name in ("dataset", OPTIONS, "args"))
     return next((init_type == "random" for init_type in given if init_type is not None), None)

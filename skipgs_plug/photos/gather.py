@@ -26,7 +26,7 @@ UNREADABLE = (".heic", ".heif", ".dng", ".cr2", ".nef", ".arw")
 MODEL, FOCAL_LENGTH, EXIF_BLOCK = 0x0110, 0x920A, 0x8769  # EXIF tags
 QUALITY: dict[str, Any] = {"quality": 97, "subsampling": 0}  # options of Pillow for JPEG files
 OPAQUE = 128  # least alpha, of 255, of a pixel that is not masked; the same as in the loaders
-REDUCED = re.compile(r"(.+)_\d+(?:_png)?")  # name of a folder of reduced photographs, as Mip-NeRF 360 and gsplat have
+REDUCED = re.compile(r"(.+)_(\d+)(?:_png)?")  # name of a folder of reduced photographs, as Mip-NeRF 360 and gsplat have
 LEAST = 3  # least number of photographs; fewer cannot be reconstructed
 
 
@@ -74,13 +74,22 @@ def photographs(folder: Path) -> Iterator[Path]:
 def is_of_copies(folder: Path) -> bool:
     """Return whether a folder such as `images_4` holds reduced copies of the photographs in `images` beside it.
 
-    With them each photograph would count twice, and held-out views would be trained on.
+    With them each photograph would count twice, and held-out views would be trained on. Cameras that count from 1 give
+    other photographs the same names, so the widths must fit the number in the folder's name.
     """
     match = REDUCED.fullmatch(folder.name)
     whole = None if match is None else folder.with_name(match[1])
-    if whole is None or not whole.is_dir():
+    if match is None or whole is None or not whole.is_dir():
         return False
-    return {path.stem for path in folder.iterdir()} <= {path.stem for path in whole.iterdir()}
+    copies, originals = ({path.stem: path for path in one.iterdir()} for one in (folder, whole))
+    if not copies or not copies.keys() <= originals.keys():
+        return False
+    factor, name = int(match[2]), min(copies)
+    try:
+        with Image.open(copies[name]) as copy, Image.open(originals[name]) as original:
+            return factor > 1 and abs(copy.width - original.width / factor) <= 1.0
+    except OSError:  # no picture
+        return False
 
 
 def walk(folder: Path) -> Iterator[Path]:

@@ -190,14 +190,12 @@ def test_a_video_that_was_held_upright(pattern, tmp_path, turn):
 
 def test_reduced_copies_are_left_out(pattern, tmp_path):
     """Folders of Mip-NeRF 360 and LLFF hold each photograph in several sizes."""
-    for name in ("images", "images_4", "images_8_png", "evening_2", "walk_2"):
+    photograph = Image.fromarray(pattern)
+    sizes = {"images": 1, "images_4": 4, "images_8_png": 8, "evening_2": 2, "walk": 1, "walk_2": 1}
+    for name, factor in sizes.items():
         (tmp_path / name).mkdir()
-    for number in range(4):
-        for file in (f"images/{number}.jpg", f"images_4/{number}.jpg", f"images_8_png/{number}.png"):
-            Image.fromarray(pattern).save(tmp_path / file)
-    (tmp_path / "walk").mkdir()
-    Image.fromarray(pattern).save(tmp_path / "walk/a.jpg")
-    Image.fromarray(pattern).save(tmp_path / "walk_2/b.jpg")  # another walk
-    Image.fromarray(pattern).save(tmp_path / "evening_2/c.jpg")  # there is no folder `evening`
+        for number in (1, 2):  # the second walk has other photographs of the same names
+            file = tmp_path / name / f"{number}.{'png' if name.endswith('png') else 'jpg'}"
+            photograph.resize((round(photograph.width / factor), round(photograph.height / factor))).save(file)
     names = gather(tmp_path, tmp_path.with_name("gathered"), 10, lambda n: None).names
-    assert names == ["evening_2/c.jpg", *(f"images/{n}.jpg" for n in range(4)), "walk/a.jpg", "walk_2/b.jpg"]
+    assert names == [f"{folder}/{n}.jpg" for folder in ("evening_2", "images", "walk", "walk_2") for n in (1, 2)]
