@@ -12,7 +12,8 @@ PYTHON = re.compile(r"python(\d+(\.\d+)?)?(\.exe)?")
 SHELLS = {"bash", "sh", "zsh", "fish"}
 LAUNCHERS = {"torchrun", "accelerate", "deepspeed", "fabric"}  # they start processes, each of which needs a gate
 VARIABLE = re.compile(r"[A-Za-z_]\w*=")
-BEGINNING = 512  # bytes of a program that name its interpreter, also in the form for long paths, which has two lines
+BEGINNING = 512  # bytes of a program that name its interpreter
+LONG_PATH = b"'''exec'"  # how pip begins the second line where the interpreter's path is too long for the first one
 
 
 def wrapper_hint(name: str) -> str | None:
@@ -50,8 +51,9 @@ def program_hint(name: str) -> str | None:
             beginning = file.read(BEGINNING)
     except OSError:  # it may be executed, but not read
         beginning = b""
-    words = re.split(rb"[\s'\"]+", beginning) if beginning.startswith(b"#!") else []
-    interpreter = next((word.removeprefix(b"#!") for word in words if b"python" in word), None)
+    first, second, *_ = [*beginning.splitlines(), b"", b""]
+    line = second if second.startswith(LONG_PATH) else first if first.startswith(b"#!") else b""
+    interpreter = next((word for word in re.split(rb"[\s'\"!]+", line) if b"python" in word), None)
     if interpreter is not None and interpreter in (os.fsencode(sys.executable), b"python", b"python3"):
         return f"{name} is a Python script on the PATH: give its path, {program}."
     if interpreter is not None:

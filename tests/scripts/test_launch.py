@@ -202,7 +202,7 @@ def test_a_command_of_another_python_is_named(tmp_path, monkeypatch):
         (f"#!{sys.executable}", "is a Python script on the PATH: give its path"),
         ("#!/usr/bin/env python3", "is a Python script on the PATH: give its path"),
         ("#!/bin/sh\n'''exec' '/elsewhere/long path/bin/python' \"$0\" \"$@\"", "belongs to another Python"),
-        ("#!/bin/sh", "is a program, and no Python script"),
+        ("#!/bin/sh\nexec python train.py", "is a program, and no Python script"),
     ],
 )
 def test_what_runs_a_program_is_read_from_its_beginning(beginning, sentence, tmp_path, monkeypatch):
