@@ -105,8 +105,9 @@ def test_an_entry_that_is_missing_or_of_another_type_is_an_error_or_harmless(kin
     """Every entry of a state is taken away once, and replaced by everything else once."""
     settings: dict = {"start_iter": 0} | ({"refine_share": 0.5} if kind == "refinement" else {})
     gate = SkipGate(**settings)
-    for _step in gate.iterations(range(1)):
+    for _step in gate.iterations(range(601)):
         gate.backward(torch.tensor(1.0, requires_grad=True), view="a", step=0)
+        break
     whole = RELEASE if kind == "release" else json.loads(json.dumps(gate.state_dict()))
     refused = 0
     for path in entries(whole):
