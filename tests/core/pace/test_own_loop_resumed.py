@@ -131,12 +131,18 @@ def test_a_refused_state_changes_nothing():
         assert gate.state_dict()["pace"] == before
 
 
-def test_a_loop_that_goes_on_with_more_iterations_is_refused():
+def state_after(last, numbers):
+    """Return the gate's state after iteration `last` of a loop over `numbers`, which goes on to its end."""
     with SkipGate(start_iter=10, refine_share=0.4) as gate:
-        for step in gate.iterations(range(40), always=()):
+        for step in gate.iterations(numbers, always=()):
             gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
-            if step == 15:
+            if step == last:
                 state = gate.state_dict()
+    return state
+
+
+def test_a_loop_that_goes_on_with_more_iterations_is_refused():
+    state = state_after(15, range(40))
     for numbers, refused in ((range(16, 40), False), (range(16, 400), True)):
         with SkipGate(start_iter=10, refine_share=0.4) as gate:
             gate.load_state_dict(state)
@@ -146,11 +152,7 @@ def test_a_loop_that_goes_on_with_more_iterations_is_refused():
 
 
 def test_a_state_with_larger_steps_does_not_go_on_without():
-    with SkipGate(start_iter=10, refine_share=0.4) as gate:
-        for step in gate.iterations(range(100), always=()):
-            gate.backward(torch.ones((), requires_grad=True), view="a", step=step)
-            if step == 20:
-                state = gate.state_dict()
+    state = state_after(20, range(100))
     with SkipGate(start_iter=10, refine_share=0.4, compensate=False) as gate:
         gate.load_state_dict(state)
         with pytest.raises(SkipGSError, match="saved with larger, shrinking steps, which are off now"):
