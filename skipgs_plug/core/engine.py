@@ -319,6 +319,7 @@ class Engine:
             "step": self.iteration.step,
             "pace": self.pace.state_dict(),
             "visibility": self.rates.visibility.state_dict(),
+            "size_bound": self.rates.sizes.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -361,12 +362,13 @@ class Engine:
             self.load_state_dict(state)
 
     def _load_pace(self, whole: dict[str, Any]) -> None:
-        """Load the state of the pace and of visibility; the authors' controller has neither."""
+        """Load the states of the pace and of its steps; the authors' controller has none."""
         state = whole.get("pace")
         if (state is None) == self.pace.leaves_out:
             raise other_shares(state, self.config)
         if "visibility" in whole:
             self.rates.visibility.load_state_dict(whole["visibility"])
+            self.rates.sizes.load_state_dict(whole["size_bound"])
         if state is not None:
             self.pace.load_state_dict(state)
 

@@ -173,6 +173,7 @@ class GateState(TypedDict):
     step: int | None
     pace: PaceState | None
     visibility: tuple[float, float, int, float, float]  # content of `Visibility.state_dict()`
+    size_bound: tuple[float, int]  # content of `SizeBound.state_dict()`
 
 
 class ReleaseStats(TypedDict):
@@ -248,8 +249,8 @@ def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
                 "The gate state was saved by a version before 0.2.0, which left out iterations in another way; "
                 "continue with that version, or start the gate afresh."
             )
-        # Complete states of earlier versions: at first no iterations were left out, and visibility was not measured.
-        state = {"pace": None, **state}
+        # Complete states of earlier versions: at first no iterations were left out, and nothing was measured.
+        state = {"pace": None, "size_bound": [0.0, 0], **state}
         visibility = state.setdefault("visibility", state.pop("shown", [0.0, 0]))  # the entry was called "shown"
         if isinstance(visibility, (list, tuple)) and len(visibility) == 2:  # sums were never unread
             state["visibility"] = [*visibility, visibility[1], 0.0, 0.0]

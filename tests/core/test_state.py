@@ -212,7 +212,7 @@ def test_a_state_from_before_shares_were_looked_at_has_seen_no_step() -> None:
     gate = SkipGate(start_iter=0, warmup=2)
     gate.backward(torch.tensor(1.0, requires_grad=True), view="a", step=0)
     state = gate.state_dict()
-    del state["visibility"], state["pace"]
+    del state["visibility"], state["pace"], state["size_bound"]
     gate = SkipGate(start_iter=0, warmup=2)
     gate.load_state_dict(state)
     assert gate.state_dict()["visibility"] == [0.0, 0.0, 0, 0.0, 0.0]

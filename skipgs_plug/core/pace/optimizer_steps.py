@@ -6,10 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.utils.hooks import RemovableHandle
 
 from skipgs_plug.core.pace.own_steps import OwnSteps
 from skipgs_plug.core.pace.parts import OptimizerInfo, ScaledGroup
+from skipgs_plug.core.pace.size_bound import SizeBound
 from skipgs_plug.core.pace.step_reads import is_torchs
 
 
@@ -20,6 +22,7 @@ class OptimizerSteps:
         optimizer: The optimizer.
         name: Name of the optimizer, if its groups have no names; None if unknown.
         under_way: Steps of all optimizers that have begun and not ended, outermost first.
+        sizes: Bounds longer steps of scales.
         failed: Receives errors at the end of a step, and raises them or releases the gate.
 
     Attributes:
@@ -32,19 +35,22 @@ class OptimizerSteps:
         own: Finds out which settings a step reads, if it is not one of PyTorch's; None if it reads all of them.
     """
 
-    __slots__ = ("_failed", "_under_way", "before", "depth", "gone", "handles", "info", "own")
+    __slots__ = ("_failed", "_grown", "_sizes", "_under_way", "before", "depth", "gone", "handles", "info", "own")
 
     def __init__(
         self,
         optimizer: torch.optim.Optimizer,
         name: str | None,
         under_way: list[OptimizerSteps],
+        sizes: SizeBound,
         failed: Callable[[Exception], None],
     ) -> None:
         self.info = OptimizerInfo(optimizer, name)
         self.handles: list[RemovableHandle] = []
         self.gone: Any = None
-        self._under_way, self._failed = under_way, failed
+        self._under_way, self._sizes, self._failed = under_way, sizes, failed
+        # Scales that take a longer step, their values before it, and how many times as long it is.
+        self._grown: list[tuple[Tensor, Tensor, float]] = []
         self.depth = 0
         self.before: list[tuple[dict[str, Any], Any, Any]] = []
         self.own = None if is_torchs(optimizer) else OwnSteps()
@@ -64,7 +70,10 @@ class OptimizerSteps:
             rate, betas = group.get("lr"), group.get("betas")
             before.append((group, rate, betas))
             if rate is not None:
-                group["lr"] = rate * one.times_rate(factor, rate)
+                times = one.times_rate(factor, rate)
+                group["lr"] = rate * times
+                if one.scales is not None and times > 1.0:
+                    self._grown.append((one.scales, self._sizes.before(one.scales), times))
             if betas is not None and longer is not None:
                 group["betas"] = longer.short if betas is longer.betas else longer.shorter(betas)
         if self.own is not None:
@@ -83,6 +92,8 @@ class OptimizerSteps:
     def end(self, optimizer: torch.optim.Optimizer) -> None:
         """Restore the trainer's settings before other code reads them, and judge a watched step."""
         self._under_way.remove(self)
+        for scales, before, times in self._grown:
+            self._sizes.after(scales, before, times)
         self.put_back()
         if self.own is not None and self.own.end(optimizer):
             self.own = None
@@ -102,5 +113,6 @@ class OptimizerSteps:
             if betas is not None:
                 group["betas"] = betas
         self.before.clear()
+        self._grown.clear()
         if self.own is not None:
             self.own.put_back()

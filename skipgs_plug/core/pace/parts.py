@@ -163,6 +163,7 @@ class ScaledGroup(NamedTuple):
         most: Bound on the factor, before it is multiplied.
         longer: Facts about the group if its steps are larger and have a smaller beta2; else None.
         highest: Bound on the learning rate that results.
+        scales: The Gaussians' scales [N, K], if the group holds them alone; else None.
     """
 
     group: dict[str, Any]
@@ -170,6 +171,7 @@ class ScaledGroup(NamedTuple):
     most: float
     longer: GroupInfo | None
     highest: float = math.inf
+    scales: Tensor | None = None
 
     def times_rate(self, factor: float, rate: Any) -> float:
         """Return the multiple of its learning rate that the group takes.
@@ -193,6 +195,7 @@ class GrowingParts(NamedTuple):
         highest_opacity_rate: Learning rate that longer steps of opacities do not exceed.
         only_higher_bands: Whether no steps are longer but those of the colours' higher bands.
         all_remember: Whether all parameters keep the trainer's beta2; see `needs.SELDOM_SHOWN`.
+        bounded: Whether sizes are bounded; see `SizeBound`.
     """
 
     opacities: float
@@ -202,6 +205,7 @@ class GrowingParts(NamedTuple):
     highest_opacity_rate: float = math.inf
     only_higher_bands: bool = False
     all_remember: bool = False
+    bounded: bool = True
 
     def of(self, info: GroupInfo) -> float:
         """Return the multiple of the common factor that a group other than opacities takes; 0 if it keeps its rate."""
@@ -321,7 +325,8 @@ def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
     if part == CONSTANT_BAND and constant_alone:
         part = OTHERS
     highest = positions_rate if growing is None and info.named_positions else math.inf
-    return ScaledGroup(info.group, part, math.inf, longer, highest)
+    bounded = info.named_scales and (growing is None or growing.bounded)
+    return ScaledGroup(info.group, part, math.inf, longer, highest, info.first if bounded else None)
 
 
 def _recovering(rate: float, least: float) -> float:

@@ -18,6 +18,7 @@ from skipgs_plug.core.optimizers import Optimizers, with_names
 from skipgs_plug.core.pace.fading import Fading
 from skipgs_plug.core.pace.optimizer_steps import OptimizerSteps
 from skipgs_plug.core.pace.parts import UNCHANGED, Division, GrowingParts, OptimizerInfo, ScaledGroup
+from skipgs_plug.core.pace.size_bound import SizeBound
 from skipgs_plug.core.pace.visibility import VISIBLE, Visibility
 
 # Least share of the iterations that steps are made longer for. With a smaller share, steps that conserve the whole path
@@ -92,6 +93,7 @@ class ScaledRates:
         only: The argument.
         visibility: Share of the Gaussians that a view shows, measured in the steps scaled so far.
         fading: Whether opacities fall in the first steps.
+        sizes: Bound on longer steps of scales.
         opacity_rate: See `Division`.
         positions_rate: See `Division`.
         on_error: Receives errors of hooks, and raises them or releases the gate. None raises them.
@@ -101,6 +103,7 @@ class ScaledRates:
         self.only = only
         self.visibility = Visibility()
         self.fading = Fading()
+        self.sizes = SizeBound()
         self.on_error: Callable[[Exception], None] | None = None
         self._factor: float | None = None
         self.opacity_rate, self.positions_rate = 0.0, math.inf
@@ -262,7 +265,7 @@ class ScaledRates:
                 self._foreign.add(key)
                 return None
             name = names[0]
-        step = OptimizerSteps(optimizer, name, self._under_way, self._failed)
+        step = OptimizerSteps(optimizer, name, self._under_way, self.sizes, self._failed)
         step.handles = self._watch(optimizer, step)
         self._steps[key] = step
         # Python can give the id of a deleted optimizer to a new one.
