@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# Share of the Gaussians that may be larger than the bound. With none the bound would be the present largest size, and
-# hold nothing; MCMC begins with a tenth of the usual sizes, so sizes at the start alone would hold nearly all.
-LARGEST = 0.001
+# Largest share of the Gaussians that the bound holds back. Some scenes begin with small Gaussians of equal size, such as
+# random points, and most of them must grow. With a thousandth, office gains 0.14 instead of 0.37 dB.
+LARGEST = 0.01
 ROWS = 8192  # rows that the share is counted in, evenly spread
 EVERY = 50  # number of longer steps between two counts; sizes change by a few percent a step
 
@@ -20,8 +20,8 @@ class SizeBound:
     Gaussian grew to 20 times the size of the cameras' circle, and covered a held-out view (21.7 instead of 28.4 dB).
     With the bound, schedules of 3,000 iterations gain 0.37 dB on office and 0.13 dB on fox (three seeds).
 
-    The bound is the largest size at the first longer step, or the size that a thousandth of the Gaussians exceed, if
-    it is larger. It never falls. It needs no unit and no activation: any scale that rises with the size will do.
+    The bound is the largest size at the first longer step, or the size that a hundredth of the Gaussians exceed, if it
+    is larger. It never falls. It needs no unit and no activation: any scale that rises with the size will do.
 
     Nothing is read from a device.
     """
@@ -38,7 +38,7 @@ class SizeBound:
                 self._bound = _sizes(scales).max()
             elif self._steps % EVERY == 0:
                 sizes = _sizes(scales[:: max(len(scales) // ROWS, 1)])
-                for exceeded in sizes.topk(int(LARGEST * len(sizes))).values[-1:]:  # none in a model of less than 1,000
+                for exceeded in sizes.topk(int(LARGEST * len(sizes))).values[-1:]:  # none in a model of less than 100
                     self._bound = torch.maximum(self._bound.to(exceeded), exceeded)
             self._steps += 1
         return scales.clone()

@@ -68,7 +68,7 @@ def test_steps_that_are_not_longer_are_the_trainers_own(rates):
     assert step(optimizer, 1.0).eq(0.5).all()
 
 
-def test_a_thousandth_of_the_gaussians_may_be_larger():
+def test_a_hundredth_of_the_gaussians_may_be_larger():
     bound, sizes = SizeBound(), torch.zeros(4000, 3)
     for _ in range(EVERY):
         bound.before(sizes)
