@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# Largest share of the Gaussians that the bound holds back. Some scenes begin with small Gaussians of equal size, such as
-# random points, and most of them must grow. With a thousandth, office gains 0.14 instead of 0.37 dB.
+# Largest share of the Gaussians that the bound holds back. Some scenes begin with small Gaussians of equal size, as
+# random points do, and most of them must grow. With a thousandth, office gains 0.14 instead of 0.37 dB.
 LARGEST = 0.01
 ROWS = 8192  # rows that the share is counted in, evenly spread
 EVERY = 50  # number of longer steps between two counts; sizes change by a few percent a step
