@@ -17,7 +17,6 @@ from skipgs_plug.bench.controls import PlannedSkipping, periodic_skipping, rando
 from skipgs_plug.bench.record import RunRecord
 from skipgs_plug.core.pace.rates import path_factor
 from skipgs_plug.trainer import Trainer
-from skipgs_plug.trainer.errors import InputError
 
 REFERENCE = "own"  # policy that all others are compared with
 COPIED = "refine_share=0.4"  # policy whose steps and iterations the controls copy
@@ -209,29 +208,6 @@ def number_after(setting: str, name: str) -> float | None:
     """Return X of a policy named `setting=X`, in (0, 1]; None if it has another name."""
     found = re.fullmatch(rf"{setting}=(\d*\.?\d+)", name)
     return float(found[1]) if found is not None and 0.0 < float(found[1]) <= 1.0 else None
-
-
-def check_policies(
-    names: Sequence[str], find: Callable[[str], BenchPolicy | None], known: Mapping[str, BenchPolicy]
-) -> None:
-    """Raise InputError if no policy is given, or if one is unknown, given twice, or lacks a policy that it needs.
-
-    Args:
-        names: Policies to run.
-        find: Returns the policy with a name, or None if it does not exist.
-        known: Policies that the message lists.
-    """
-    if not names:
-        raise InputError(f"--policies is empty; give some of {', '.join(known)}, or leave it out for all.")
-    for name in names:
-        spec = find(name)
-        if spec is None:
-            raise InputError(f"There is no policy {name!r}; the policies are {', '.join(known)}.")
-        if names.count(name) > 1:
-            raise InputError(f"Policy {name!r} is given twice.")
-        missing = [other for other in spec.needs if other not in names]
-        if missing:
-            raise InputError(f"Policy {name!r} copies rate or time of {missing[0]!r}; add {missing[0]} to --policies.")
 
 
 def rounds(specs: Sequence[AnyBenchPolicy], position: int) -> list[list[AnyBenchPolicy]]:

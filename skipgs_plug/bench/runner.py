@@ -11,8 +11,8 @@ from typing import Any
 
 from skipgs_plug.bench import provenance
 from skipgs_plug.bench.choices import Clock
-from skipgs_plug.bench.find import find_policy, known_policies
-from skipgs_plug.bench.policies import BenchPolicy, Earlier, check_policies, refinement_policy, rounds
+from skipgs_plug.bench.find import find_policy, require_policies
+from skipgs_plug.bench.policies import BenchPolicy, Earlier, refinement_policy, rounds
 from skipgs_plug.bench.record import RunRecord
 from skipgs_plug.bench.refine import NotRunError, RunDivergedError, densify, refine
 from skipgs_plug.bench.store import BenchFolder
@@ -62,7 +62,7 @@ class Bench:
         clock: Clock | None = None,
         whole: bool = False,
     ) -> None:
-        check_policies(policies, lambda name: find_policy(name, whole), known_policies(whole))
+        require_policies(policies, whole)
         if not seeds or len(set(seeds)) < len(seeds):
             raise InputError("Give at least one seed, each once.")
         stop = config.scaled(config.recipe.refine_stop_iter)

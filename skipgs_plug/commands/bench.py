@@ -6,9 +6,8 @@ import dataclasses
 
 from skipgs_plug.bench.decisions import FILE as DECISIONS
 from skipgs_plug.bench.decisions import write_decisions
-from skipgs_plug.bench.find import find_policy, known_policies
+from skipgs_plug.bench.find import known_policies, require_policies
 from skipgs_plug.bench.plots import write_plots
-from skipgs_plug.bench.policies import check_policies
 from skipgs_plug.bench.result import build_result
 from skipgs_plug.bench.runner import Bench
 from skipgs_plug.bench.store import BenchFolder
@@ -29,9 +28,9 @@ def run(args: Args) -> int:
 
 def compare(args: Args) -> list[Row]:
     """Run the missing policies, print the table, write bench.json, decisions.json, table.md and plots; return rows."""
-    whole, known = args.whole, known_policies(args.whole)
-    policies = tuple(known) if args.policies is None else args.policies
-    check_policies(policies, lambda name: find_policy(name, whole), known)
+    whole = args.whole
+    policies = tuple(known_policies(whole)) if args.policies is None else args.policies
+    require_policies(policies, whole)
     config = dataclasses.replace(args.train, data_dir=args.scene, result_dir=args.out)
     scene = load_scene(args.scene, config.data_factor, config.test_every, config.init_num_pts, config.init_ply)
     folder = BenchFolder(args.out)

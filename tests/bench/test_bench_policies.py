@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from skipgs_plug.bench.find import find_policy, known_policies
-from skipgs_plug.bench.policies import POLICIES, check_policies, rounds
+from skipgs_plug.bench.find import find_policy, require_policies
+from skipgs_plug.bench.policies import POLICIES, rounds
 from skipgs_plug.bench.record import RunRecord
 from skipgs_plug.trainer import InputError, TrainConfig, Trainer
 
@@ -12,6 +12,9 @@ from skipgs_plug.trainer import InputError, TrainConfig, Trainer
     ("names", "named"),
     [
         (("own", "gatee"), "'gatee'"),
+        (("own", "share=auto"), "give --whole"),
+        (("own", "share=0.4"), "give --whole"),
+        (("own", "share=4"), "no policy 'share=4'"),
         (("own", "own"), "given twice"),
         (("own", "random"), "add gate"),
         (("gate", "shortened"), "add own"),
@@ -19,7 +22,7 @@ from skipgs_plug.trainer import InputError, TrainConfig, Trainer
 )
 def test_unusable_policies_are_refused_by_name(names, named):
     with pytest.raises(InputError, match=named):
-        check_policies(names, lambda name: find_policy(name, whole=False), known_policies(whole=False))
+        require_policies(names, whole=False)
 
 
 def test_policies_run_in_turns_with_those_that_copy_from_the_same_rounds():

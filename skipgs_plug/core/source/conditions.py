@@ -55,7 +55,9 @@ def conditions_in(
                 yield from conditions_in(inside.body, functions, reached, inside, unread)
         if isinstance(statement, (ast.If, ast.While)):
             yield Condition(statement.test, guards, function)
-            yield from conditions_in(statement.body, functions, (*guards, statement.test), function, unread)
+            # If the loop ends in the body, no other iteration comes to its conditions.
+            if function is not None or not isinstance(statement.body[-1], (ast.Return, ast.Raise)):
+                yield from conditions_in(statement.body, functions, (*guards, statement.test), function, unread)
             yield from conditions_in(statement.orelse, functions, (*guards, _not(statement.test)), function, unread)
         else:
             if isinstance(statement, ast.Match):

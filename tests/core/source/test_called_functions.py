@@ -238,6 +238,23 @@ def test_condition_of_the_loop_on_a_value_that_a_called_function_changes_is_a_wa
         assert numbers(loop) == [60]
 
 
+def test_conditions_where_the_loop_ends_name_no_iterations(recwarn):
+    def loop(stop):
+        saver = Saver(40)
+        for step in stop(saver=saver):
+            while saver.last == "paused":
+                if saver.last is None:
+                    saver.by_account(step)
+                    return
+            if step == 70:
+                print(step % 9)
+                raise RuntimeError("the condition itself is one of the loop's")
+            saver.last = step
+
+    assert numbers(loop) == [70]
+    assert not recwarn
+
+
 def test_constant_that_a_function_may_switch_counts_as_on():
     def loop(stop):
         for step in stop():
