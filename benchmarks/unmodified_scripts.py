@@ -6,7 +6,8 @@
     python benchmarks/unmodified_scripts.py pictures OUT/test/ours_3000
     python benchmarks/script_table.py benchmarks/results/scripts/runs.json > benchmarks/results/scripts/table.md
 
-These scripts fix their seeds. A second run starts from another draw of the scene's points (`scene --seed 1`).
+These scripts fix their seeds, except that of pip gaussian-splatting, whose order of views is another one in each run.
+A second run starts from another draw of the scene's points (`scene --seed 1`).
 All scripts are measured alike: this package renders their PLY from the held-out cameras. A PLY of Mip-Splatting
 contains a 3D filter, which is applied together with its 2D filter of 0.1 square pixels. For scripts without a PLY in
 the scene's coordinates (Scaffold-GS, gsplat, nerfstudio) the pictures that the project wrote are measured, in 8 bits.

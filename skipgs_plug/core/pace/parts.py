@@ -86,6 +86,7 @@ class GroupInfo:
         positions: Parameters that may be positions [N, 3].
         named_positions: Whether the name says that they are positions.
         named_scales: Whether the name says that they are scales.
+        scales: The only parameter of a group of scales, if it has up to three for each Gaussian; else None.
         no_bands: Whether it is the group of higher bands in a model that has none: [N, 0, 3].
         betas: The trainer's betas when `shorter` was called last.
         short: The betas that `shorter` returned then.
@@ -103,6 +104,7 @@ class GroupInfo:
         "no_bands",
         "part",
         "positions",
+        "scales",
         "short",
     )
 
@@ -119,6 +121,7 @@ class GroupInfo:
         self._shaped = all(shape in GAUSSIAN_SHAPES or (len(shape) == 2 and shape[1] == 3) for shape in shapes)
         self.named_positions = known in POSITIONS
         self.named_scales = known in SCALES
+        self.scales = self.first if self.named_scales and shapes[0] in ((1,), (2,), (3,)) else None
         self.no_bands = bool(shapes) and all(shape == (0, 3) for shape in shapes)
         may_be = self._params if known is None or known in POSITIONS else []
         self.positions = [param for param in may_be if param.ndim == 2 and param.shape[1] == 3]
@@ -163,7 +166,7 @@ class ScaledGroup(NamedTuple):
         most: Bound on the factor, before it is multiplied.
         longer: Facts about the group if its steps are larger and have a smaller beta2; else None.
         highest: Bound on the learning rate that results.
-        scales: The Gaussians' scales [N, K], if the group holds them alone; else None.
+        scales: The Gaussians' scales [N, 1 to 3], if the group holds them alone; else None. Anchors have six.
     """
 
     group: dict[str, Any]
@@ -325,8 +328,8 @@ def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
     if part == CONSTANT_BAND and constant_alone:
         part = OTHERS
     highest = positions_rate if growing is None and info.named_positions else math.inf
-    bounded = info.named_scales and (growing is None or growing.bounded)
-    return ScaledGroup(info.group, part, math.inf, longer, highest, info.first if bounded else None)
+    bounded = growing is None or growing.bounded
+    return ScaledGroup(info.group, part, math.inf, longer, highest, info.scales if bounded else None)
 
 
 def _recovering(rate: float, least: float) -> float:

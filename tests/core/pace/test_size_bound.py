@@ -33,15 +33,14 @@ def step(optimizer, direction):
 def test_sizes_beyond_the_largest_one_at_the_start_grow_as_in_the_trainers_own_steps(rates, growing):
     optimizer, scales = model([1.0, 2.0, 8.0])
     rates.scale(3.0, growing)
-    assert step(optimizer, 1.0).eq(TIMES).all()  # the largest one is at the bound
-    rates.scale(3.0, growing)
     assert step(optimizer, 1.0)[:, 0].tolist() == [TIMES, TIMES, 1.0]
-    # One axis beyond the bound is enough, and all axes of that Gaussian count.
     with torch.no_grad():
-        scales[1, 2] = math.log(20.0)
+        scales[1] = torch.tensor([0.0, 20.0, 7.999]).log()
     rates.scale(3.0, growing)
     moved = step(optimizer, 1.0)
-    assert moved[0].eq(TIMES).all() and moved[1:].eq(1.0).all()
+    assert moved[0].eq(TIMES).all() and moved[2].eq(1.0).all()
+    assert moved[1, 1] == 1.0  # one axis of a Gaussian
+    assert scales[1, 2].item() == pytest.approx(math.log(7.999) + 0.1)  # a longer step takes none beyond the bound
 
 
 def test_large_sizes_shrink_in_longer_steps(rates):
@@ -89,8 +88,7 @@ def test_a_model_of_few_gaussians(rows):
         before = bound.before(scales)
         scales += 1.0
         bound.after(scales, before, 4.0)
-    # The first step is a whole one, and the others are shortened.
-    assert scales.tolist() == [[1.0 + EVERY / 4.0] * 3] * rows
+    assert scales.tolist() == [[(EVERY + 1) / 4.0] * 3] * rows
 
 
 def test_the_bound_goes_on_from_a_state():
@@ -103,12 +101,23 @@ def test_the_bound_goes_on_from_a_state():
     before = other.before(scales)
     scales += 1.0
     other.after(scales, before, 4.0)
-    assert scales.tolist() == [[1.0, pytest.approx(1.7)], [0.25, pytest.approx(1.05)]]
+    assert scales.tolist() == [[pytest.approx(0.7), pytest.approx(0.95)], [pytest.approx(0.7), pytest.approx(1.05)]]
 
 
 def test_numbers_that_are_not_finite_are_left_alone():
-    bound, scales = SizeBound(), torch.tensor([[math.nan], [1.0]])
+    bound, scales = SizeBound(), torch.tensor([[-math.inf, 1.0]])
     before = bound.before(scales)
     scales += 1.0
-    bound.after(scales, before, 4.0)
-    assert scales[1].item() == 2.0 and math.isnan(scales[0].item())
+    scales = torch.cat([scales, torch.full((1, 2), math.nan)])
+    bound.after(scales, torch.cat([before, torch.zeros(1, 2)]), 4.0)
+    assert scales[0].tolist() == [-math.inf, 1.25] and scales[1].isnan().all()
+
+
+def test_anchors_have_no_sizes(rates):
+    optimizer = torch.optim.SGD([{"params": [torch.nn.Parameter(torch.zeros(4, 6))], "name": "scaling"}], lr=0.1)
+    (param,) = optimizer.param_groups[0]["params"]
+    for _ in range(2):
+        rates.scale(3.0)
+        param.grad = -torch.ones_like(param)
+        optimizer.step()
+    assert rates.sizes.state_dict() == [0.0, 0] and param.eq(0.2 * TIMES).all()
