@@ -173,7 +173,7 @@ class GateState(TypedDict):
     step: int | None
     pace: PaceState | None
     visibility: tuple[float, float, int, float, float]  # content of `Visibility.state_dict()`
-    size_bound: tuple[float, int]  # content of `SizeBound.state_dict()`
+    size_bound: float | None  # content of `SizeBound.state_dict()`
 
 
 class ReleaseStats(TypedDict):
@@ -250,7 +250,7 @@ def gate_state(state: Mapping[str, Any]) -> dict[str, Any]:
                 "continue with that version, or start the gate afresh."
             )
         # Complete states of earlier versions: at first no iterations were left out, and nothing was measured.
-        state = {"pace": None, "size_bound": [0.0, 0], **state}
+        state = {"pace": None, "size_bound": None, **state}
         visibility = state.setdefault("visibility", state.pop("shown", [0.0, 0]))  # the entry was called "shown"
         if isinstance(visibility, (list, tuple)) and len(visibility) == 2:  # sums were never unread
             state["visibility"] = [*visibility, visibility[1], 0.0, 0.0]

@@ -42,7 +42,4 @@ def longer_steps(
     if plan.unrefined and not fading and not plan.steps_after:
         return factor, GrowingParts(opacities, positions, scales, True, HIGHEST_OPACITY_RATE)
     remember = bool(plan.random_points) and not events.resets and visible < SELDOM_SHOWN
-    # MCMC begins with a tenth of the usual sizes, and puts a price on them. With the bound it loses 0.2 dB.
-    return factor, GrowingParts(
-        opacities, positions, scales, events.clears_moments, all_remember=remember, bounded=not events.all_run
-    )
+    return factor, GrowingParts(opacities, positions, scales, events.clears_moments, all_remember=remember)

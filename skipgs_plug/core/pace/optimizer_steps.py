@@ -72,8 +72,8 @@ class OptimizerSteps:
             if rate is not None:
                 times = one.times_rate(factor, rate)
                 group["lr"] = rate * times
-                if one.scales is not None and times > 1.0:
-                    self._grown.append((one.scales, self._sizes.before(one.scales), times))
+                if one.scales is not None and times > 1.0 and self._sizes.measured:
+                    self._grown.append((one.scales, one.scales.detach().clone(), times))
             if betas is not None and longer is not None:
                 group["betas"] = longer.short if betas is longer.betas else longer.shorter(betas)
         if self.own is not None:
@@ -93,7 +93,7 @@ class OptimizerSteps:
         """Restore the trainer's settings before other code reads them, and judge a watched step."""
         self._under_way.remove(self)
         for scales, before, times in self._grown:
-            self._sizes.after(scales, before, times)
+            self._sizes.shorten(scales, before, times)
         self.put_back()
         if self.own is not None and self.own.end(optimizer):
             self.own = None

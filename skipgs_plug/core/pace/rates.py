@@ -238,6 +238,7 @@ class ScaledRates:
         if not self.visibility.complete:
             self.visibility.see(info.positions)
         if info.known_positions is not None:
+            self.sizes.measure(info.known_positions)
             self._rows = self._rows_now = info.known_positions.shape[0]
         else:  # in groups without names, positions of cameras have the shape of positions of Gaussians, but fewer rows
             self._rows_now = max(self._rows_now, *(param.shape[0] for param in info.positions))
