@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 # The bound, as a multiple of the median distance of the Gaussians from their median. Room must be left for the
-# background: with a third of it, Inria's script ends 0.3 dB (.008 SSIM) lower on bonsai.
+# background: with a quarter of it, Inria's script ends 0.3 dB (.008 SSIM) lower on bonsai.
 SPREAD = 2.5
 ROWS = 8192  # positions that are measured, evenly spread
 
