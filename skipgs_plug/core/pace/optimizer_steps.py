@@ -92,9 +92,10 @@ class OptimizerSteps:
     def end(self, optimizer: torch.optim.Optimizer) -> None:
         """Restore the trainer's settings before other code reads them, and judge a watched step."""
         self._under_way.remove(self)
-        for scales, before, times in self._grown:
-            self._sizes.shorten(scales, before, times)
+        grown, self._grown = self._grown, []
         self.put_back()
+        for scales, before, times in grown:
+            self._sizes.shorten(scales, before, times)
         if self.own is not None and self.own.end(optimizer):
             self.own = None
 

@@ -69,6 +69,23 @@ def test_the_bound_is_that_of_the_first_step(rates):
     assert rates.sizes.state_dict() == pytest.approx(BOUND)
 
 
+def test_rates_are_the_trainers_after_a_step_that_cannot_be_shortened(rates):
+    class Growing(torch.optim.SGD):
+        def step(self):  # type: ignore[override]
+            super().step()
+            param = self.param_groups[1]["params"][0]
+            param.data = torch.cat([param.data, param.data])
+
+    optimizer, _ = model([[1.0]] * 5)
+    optimizer, failed = Growing(optimizer.param_groups, lr=RATE), []
+    rates.on_error = failed.append
+    rates.scale(3.0)
+    for group in optimizer.param_groups:
+        group["params"][0].grad = torch.zeros_like(group["params"][0])
+    optimizer.step()
+    assert len(failed) == 1 and all(group["lr"] == RATE for group in optimizer.param_groups)
+
+
 def test_anchors_have_no_sizes(rates):
     optimizer, scales = model([[1000.0] * 6] * 5)
     rates.scale(3.0)
