@@ -42,4 +42,7 @@ def longer_steps(
     if plan.unrefined and not fading and not plan.steps_after:
         return factor, GrowingParts(opacities, positions, scales, True, HIGHEST_OPACITY_RATE)
     remember = bool(plan.random_points) and not events.resets and visible < SELDOM_SHOWN
-    return factor, GrowingParts(opacities, positions, scales, events.clears_moments, all_remember=remember)
+    # MCMC has a price on sizes. With a bound besides, it ends 0.2 dB lower on fern.
+    return factor, GrowingParts(
+        opacities, positions, scales, events.clears_moments, all_remember=remember, bounded=not events.all_run
+    )

@@ -198,6 +198,7 @@ class GrowingParts(NamedTuple):
         highest_opacity_rate: Learning rate that longer steps of opacities do not exceed.
         only_higher_bands: Whether no steps are longer but those of the colours' higher bands.
         all_remember: Whether all parameters keep the trainer's beta2; see `needs.SELDOM_SHOWN`.
+        bounded: Whether sizes are bounded; see `SizeBound`.
     """
 
     opacities: float
@@ -207,6 +208,7 @@ class GrowingParts(NamedTuple):
     highest_opacity_rate: float = math.inf
     only_higher_bands: bool = False
     all_remember: bool = False
+    bounded: bool = True
 
     def of(self, info: GroupInfo) -> float:
         """Return the multiple of the common factor that a group other than opacities takes; 0 if it keeps its rate."""
@@ -326,7 +328,8 @@ def _scaled(info: GroupInfo, division: Division) -> ScaledGroup | None:
     if part == CONSTANT_BAND and constant_alone:
         part = OTHERS
     highest = positions_rate if growing is None and info.named_positions else math.inf
-    return ScaledGroup(info.group, part, math.inf, longer, highest, info.scales)
+    bounded = growing is None or growing.bounded
+    return ScaledGroup(info.group, part, math.inf, longer, highest, info.scales if bounded else None)
 
 
 def _recovering(rate: float, least: float) -> float:

@@ -50,6 +50,12 @@ def test_sizes_beyond_the_scene_grow_as_in_the_trainers_own_steps(rates, growing
     assert step(optimizer, scales, -1.0).eq(TIMES).all()  # sizes shrink as all parameters move
 
 
+def test_growing_phases_without_a_bound_make_all_sizes_larger(rates):
+    optimizer, scales = model([[100.0]] * 5)
+    rates.scale(3.0, GrowingParts(1.0, 2.0, 2.0, bounded=False))
+    assert step(optimizer, scales, 1.0).eq(TIMES).all()
+
+
 def test_steps_that_are_not_longer_are_the_trainers_own(rates):
     optimizer, scales = model([[100.0]] * 5)
     rates.scale(0.25)
