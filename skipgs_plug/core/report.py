@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 from skipgs_plug.core.clock import Times
 from skipgs_plug.core.config import SkipConfig
+from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER
 from skipgs_plug.core.stats import GateStats
 from skipgs_plug.files import write_aside
 
@@ -193,6 +194,8 @@ def _why_more(growing: dict[str, Any], ended: bool) -> str:
     """Return a line that says why more than the share of the growing phase ran; empty if it did not."""
     run, asked = growing["iterations_run"], growing["iterations_run"] + growing["iterations_skipped"]
     times = growing["times_grown"]
+    if growing["share"] is not None and 0 < asked <= growing["always_run"].get(NAMED_FOR_TRAINER, 0):
+        return "\n  all of them run: this trainer needs them (docs/adapters.md), or they were named"
     if growing["share"] is None or times is None or run <= 1.1 * growing["share"] * asked or times <= 1.0:
         return ""
     early = ", or because the run ended early" if ended else ""

@@ -139,6 +139,14 @@ def test_the_summary_says_why_more_than_the_share_ran():
     assert "share of 0.25: 50 ran for the share, 51 for conditions of the loop, 0 after prunes" in gate.summary()
 
 
+def test_the_summary_says_why_all_iterations_run_while_the_scene_grows():
+    with SkipGate(start_iter=50, share=0.5, compensate=False, always=range(50)) as gate:
+        for step in gate.iterations(range(100), events=range(10, 50, 10)):
+            gate.backward(torch.tensor(0.1, requires_grad=True) * 1.0, view=f"{step % 5}.png", step=step)
+    assert gate.report()["growing"]["iterations_skipped"] == 0
+    assert "all of them run: this trainer needs them (docs/adapters.md), or they were named" in gate.summary()
+
+
 def test_a_floor_that_each_process_would_find_by_itself_is_refused_in_a_group(monkeypatch):
     larger = SkipGate(start_iter=10, compensate=True)
     monkeypatch.setattr(distributed, "group_size", lambda: 2)  # the group may come after the gate
