@@ -230,7 +230,7 @@ def test_state_keys() -> None:
     gate = SkipGate(start_iter=0)
     gate.backward(torch.tensor(1.0, requires_grad=True), view="a", step=0)
     state = gate.state_dict()
-    gate = {"version", "policy", "stats", "non_finite_in_a_row", "clock", "step", "pace", "visibility"}
+    gate = {"version", "policy", "stats", "non_finite_in_a_row", "clock", "step", "pace", "visibility", "size_bound"}
     assert set(state) == gate
     assert set(state["policy"]) == {"version", "means", "budget", "warmup_end", "pause_until", "events"}
     assert set(state["stats"]) == {"iterations", "backwards", "skips", "reasons", "events", "views"}
