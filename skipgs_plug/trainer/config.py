@@ -47,6 +47,7 @@ NUMBERS = {
     "shN_lr": (0.0, 10.0),
     "near_plane": (1e-30, 1e30),
     "far_plane": (1e-30, 1e30),
+    "clear_depth": (0.0, 1.0),
     "grow_grad2d": (0.0, 1e6),
     "grow_scale3d": (0.0, 1e6),
     "prune_opa": (0.0, 1.0),
@@ -156,6 +157,9 @@ class TrainConfig:
     """Near clipping plane, world units; default: a tenth of the depth of the nearest points that a view shows."""
     far_plane: float = 1e10
     """Far clipping plane, world units."""
+    clear_depth: float = 0.5
+    """Densification prunes Gaussians in a view's picture that are nearer to its camera than this share of the depth of
+    its nearest points: they are haze. 0 prunes none, as the plain recipe."""
 
     strategy: Literal["default", "mcmc"] = "default"
     """Densification: gsplat's DefaultStrategy (clone, split, prune) or MCMCStrategy (move, up to cap_max)."""

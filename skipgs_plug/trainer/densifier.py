@@ -9,12 +9,14 @@ import torch
 from torch import nn
 
 from skipgs_plug.trainer.backend import Backend
+from skipgs_plug.trainer.clear_views import ClearViews
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.densification import densify
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.mcmc import Mcmc
 from skipgs_plug.trainer.order import derive_seed
 from skipgs_plug.trainer.row_order import sort_rows, sorts_rows
+from skipgs_plug.trainer.scene import Scene
 from skipgs_plug.trainer.seeded import seeded
 from skipgs_plug.trainer.strategy import create_strategy, reset_opacity_if_missed
 
@@ -26,7 +28,7 @@ class Densifier:
 
     Args:
         config: Settings.
-        scene_scale: Size of the scene.
+        scene: Its size and the views that must stay clear.
         backend: Applies missed updates before rows are read.
         splats: Parameters by name.
         optimizers: One optimizer per parameter, by the same names.
@@ -40,7 +42,7 @@ class Densifier:
     def __init__(
         self,
         config: TrainConfig,
-        scene_scale: float,
+        scene: Scene,
         backend: Backend,
         splats: nn.ParameterDict,
         optimizers: dict[str, torch.optim.Optimizer],
@@ -48,7 +50,8 @@ class Densifier:
         self._seed, self._prune_opa, self._backend = config.seed, config.prune_opa, backend
         self._splats, self._optimizers = splats, optimizers
         self._stop = config.scaled(config.recipe.refine_stop_iter)
-        self.mcmc = Mcmc(config, scene_scale) if config.strategy == "mcmc" else None
+        self.mcmc = Mcmc(config, scene.scene_scale) if config.strategy == "mcmc" else None
+        self._clear_views = ClearViews(scene, config.clear_depth)
         count = len(splats["means"])
         if self.mcmc is not None and count > config.cap_max:
             log.warning(
@@ -60,7 +63,7 @@ class Densifier:
         if self.mcmc is None:
             self.strategy = create_strategy(config)
             self.strategy.check_sanity(splats, optimizers)
-            self.state = self.strategy.initialize_state(scene_scale=scene_scale)
+            self.state = self.strategy.initialize_state(scene_scale=scene.scene_scale)
 
     def before_backward(self, step: int, info: dict[str, Any]) -> None:
         """Ask for the gradients that densification averages.
@@ -95,15 +98,20 @@ class Densifier:
             self.strategy.step_post_backward(*args, info, packed=info["gaussian_ids"] is not None)
         else:
             self._backend.catch_up(self._optimizers)
+            self._fade(step)
             with seeded(derive_seed(self._seed, step), self._backend.device):
                 densify(self.strategy, *args, info, in_order=sorts_rows(self.strategy, step))
             require_some(len(self._splats["means"]) > 0, step, "lower prune_opa or raise prune_scale3d")
         reset_opacity_if_missed(self.strategy, *args)
 
+    def _fade(self, step: int) -> None:
+        self._clear_views.fade(self._splats["means"], self._splats["opacities"], derive_seed(self._seed, step))
+
     def _move(self, mcmc: Mcmc, step: int, updated: bool) -> None:
         # The noise belongs to the update: without an update it is a random walk.
         moves = mcmc.moves(step)
         if moves:
+            self._fade(step)
             alive = self._splats["opacities"].detach().sigmoid() > self._prune_opa  # others move to them
             require_some(bool(alive.any()), step, "lower prune_opa")
             self._backend.release_memory()  # gsplat copies all rows

@@ -77,7 +77,7 @@ class Trainer:
         self._since: int | None = None  # number after the previous iteration, set by `train`
         self._splats = create_splats(scene, config, self.backend.device, self.near_plane)
         self._optimizers = create_optimizers(self._splats, config, scene.scene_scale, self.backend)
-        self._densifier = Densifier(config, scene.scene_scale, self.backend, self._splats, self._optimizers)
+        self._densifier = Densifier(config, scene, self.backend, self._splats, self._optimizers)
         self.mcmc, self.strategy = self._densifier.mcmc, self._densifier.strategy
         self.strategy_state = self._densifier.state
         self.refine_stop_iter = config.scaled(config.recipe.refine_stop_iter)

@@ -29,8 +29,8 @@ def near_plane(config: TrainConfig, scene: Scene) -> float:
     """
     chosen = None if config.near_plane is None else config.near_plane / scene.frame.unit
     if chosen is None:
-        nearest = nearest_depth(scene.train, scene.points)
-        chosen = SHARE_OF_EXTENT * scene.scene_scale if nearest is None else SHARE * nearest
+        known = [depth for depth in nearest_depths(scene.train, scene.points) if depth is not None]
+        chosen = SHARE * min(known) if known else SHARE_OF_EXTENT * scene.scene_scale
         chosen = max(chosen, TINY)
     if chosen >= far_plane(config, scene):
         raise InputError(
@@ -45,21 +45,20 @@ def far_plane(config: TrainConfig, scene: Scene) -> float:
     return config.far_plane if config.far_plane == TrainConfig.far_plane else config.far_plane / scene.frame.unit
 
 
-def nearest_depth(views: list[View], points: torch.Tensor) -> float | None:
-    """Return the least depth of a view's nearest points, over all views; None if no view shows enough points.
+def nearest_depths(views: list[View], points: torch.Tensor) -> list[float | None]:
+    """Return the depth of the nearest points in each view; None for a view that shows too few points.
 
     Args:
         views: Views of the scene.
         points: Points [M, 3]. A point counts for a view if it projects into its picture, even if something hides it.
     """
     points = points[:: -(-len(points) // MOST)]
-    depths = []
+    depths: list[float | None] = []
     for view in views:
         inside = depths_in_picture(view, points)
         inside = inside[inside > 0]
-        if len(inside) >= LEAST:
-            depths.append(float(np.quantile(inside.numpy(), NEAREST)))
-    return min(depths, default=None)
+        depths.append(float(np.quantile(inside.numpy(), NEAREST)) if len(inside) >= LEAST else None)
+    return depths
 
 
 def before_a_lens(views: list[View], points: torch.Tensor, near: float) -> torch.Tensor:

@@ -30,6 +30,7 @@ VERSION = 1  # version of the format of checkpoints; a checkpoint with another o
 MOMENTS = {"step", "exp_avg", "exp_avg_sq"}
 # Settings that may differ between a run and its continuation; `_require_same_run` treats the two lengths.
 FREE_FIELDS = ("data_dir", "result_dir", "backend", "max_steps", "schedule_steps")
+BEFORE = {"clear_depth": 0.0}  # settings that had no effect before they existed
 # Errors from reading damaged bytes. A damaged byte may be part of a length, a key, a decoder or an attribute.
 DAMAGE = (
     *(pickle.UnpicklingError, zipfile.BadZipFile, EOFError, OSError, MemoryError, OverflowError),
@@ -258,8 +259,9 @@ def _require_same_run(trainer: Capturable, content: dict[str, Any], path: str | 
         raise InputError(f"Checkpoint {path} was made with other training views; resume with its own scene and split.")
     _require_same_cameras(trainer.scene, content["scene"], path)
     _require_same_sizes(trainer.scene, content["scene"], path)
-    # A checkpoint that is older than a setting was made with the present default.
-    made_with = {field.name: field.default for field in dataclasses.fields(TrainConfig)} | content["config"]
+    # A checkpoint that is older than a setting was made with the present default, or without the effect that it has.
+    present = {field.name: field.default for field in dataclasses.fields(TrainConfig)}
+    made_with = present | BEFORE | content["config"]
     for name, value in dataclasses.asdict(trainer.config).items():
         if name not in FREE_FIELDS and made_with[name] != value:
             raise InputError(

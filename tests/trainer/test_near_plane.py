@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from skipgs_plug.trainer import InputError, TrainConfig, Trainer
-from skipgs_plug.trainer.near_plane import NEAREST, SHARE, SHARE_OF_EXTENT, before_a_lens, near_plane, nearest_depth
+from skipgs_plug.trainer.near_plane import NEAREST, SHARE, SHARE_OF_EXTENT, before_a_lens, near_plane, nearest_depths
 from skipgs_plug.trainer.scene import Scene, View
 
 
@@ -32,19 +32,20 @@ def test_scales_with_the_unit_of_the_scene(unit: float) -> None:
 
 
 def test_a_few_points_at_the_lens_do_not_count_but_a_close_view_does() -> None:
-    usual = nearest_depth(scene().train, scene().points)
+    usual, _ = nearest_depths(scene().train, scene().points)
     stray = scene()
     stray.points[: int(NEAREST * 1000) // 2] = torch.tensor([0.0, 0.0, 0.01])
-    assert nearest_depth(stray.train, stray.points) == pytest.approx(usual, rel=0.05)
+    assert nearest_depths(stray.train, stray.points)[0] == pytest.approx(usual, rel=0.05)
     close = scene()
     close.train[1].viewmat[2, 3] = -3.0  # moves the camera three units forward
-    assert nearest_depth(close.train, close.points) == pytest.approx(1.0, rel=0.1)
+    assert nearest_depths(close.train, close.points) == pytest.approx([usual, 1.0], rel=0.1)
+    assert near_plane(TrainConfig(), close) == pytest.approx(SHARE, rel=0.1)  # the nearest view decides
 
 
 def test_without_points_in_view_the_cameras_tell() -> None:
     behind = scene()
     behind.points[:, 2] *= -1
-    assert nearest_depth(behind.train, behind.points) is None
+    assert nearest_depths(behind.train, behind.points) == [None, None]
     assert near_plane(TrainConfig(), behind) == pytest.approx(SHARE_OF_EXTENT * 0.55)
 
 

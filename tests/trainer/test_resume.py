@@ -139,7 +139,7 @@ def test_an_extended_run_keeps_its_schedule(tmp_path: Path, tiny_scene: Scene, t
         shorter.load_checkpoint(tmp_path / "c.pt")
 
 
-def test_a_checkpoint_older_than_a_setting_was_made_with_its_default(
+def test_a_checkpoint_older_than_a_setting_was_made_with_its_default_or_without_it(
     tmp_path: Path, trainer: Trainer, tiny_scene: Scene
 ) -> None:
     path = tmp_path / "c.pt"
@@ -150,6 +150,11 @@ def test_a_checkpoint_older_than_a_setting_was_made_with_its_default(
     trainer.load_checkpoint(path)
     with pytest.raises(InputError, match="was made with exposure=False, not True"):
         Trainer(dataclasses.replace(trainer.config, exposure=True), tiny_scene).load_checkpoint(path)
+    del content["config"]["clear_depth"]  # nothing was pruned before this setting existed
+    torch.save(content, path)
+    with pytest.raises(InputError, match=r"was made with clear_depth=0.0, not 0.5"):
+        trainer.load_checkpoint(path)
+    Trainer(dataclasses.replace(trainer.config, clear_depth=0.0), tiny_scene).load_checkpoint(path)
 
 
 WRONG = (None, "text", {"a": None}, torch.zeros(3), torch.full((160, 3), math.nan))
