@@ -158,8 +158,8 @@ class TrainConfig:
     far_plane: float = 1e10
     """Far clipping plane, world units."""
     clear_depth: float = 0.5
-    """Densification prunes Gaussians in a view's picture that are nearer to its camera than this share of the depth of
-    its nearest points: they are haze. 0 prunes none, as the plain recipe."""
+    """Densification prunes Gaussians nearer to a camera than this share of the depth of the nearest points in its view:
+    they are haze. 0 prunes none, as the plain recipe."""
 
     strategy: Literal["default", "mcmc"] = "default"
     """Densification: gsplat's DefaultStrategy (clone, split, prune) or MCMCStrategy (move, up to cap_max)."""

@@ -16,7 +16,6 @@ from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.mcmc import Mcmc
 from skipgs_plug.trainer.order import derive_seed
 from skipgs_plug.trainer.row_order import sort_rows, sorts_rows
-from skipgs_plug.trainer.scene import Scene
 from skipgs_plug.trainer.seeded import seeded
 from skipgs_plug.trainer.strategy import create_strategy, reset_opacity_if_missed
 
@@ -28,7 +27,8 @@ class Densifier:
 
     Args:
         config: Settings.
-        scene: Its size and the views that must stay clear.
+        scene_scale: Size of the scene.
+        clear_views: Fades Gaussians around cameras before each event.
         backend: Applies missed updates before rows are read.
         splats: Parameters by name.
         optimizers: One optimizer per parameter, by the same names.
@@ -42,7 +42,8 @@ class Densifier:
     def __init__(
         self,
         config: TrainConfig,
-        scene: Scene,
+        scene_scale: float,
+        clear_views: ClearViews,
         backend: Backend,
         splats: nn.ParameterDict,
         optimizers: dict[str, torch.optim.Optimizer],
@@ -50,8 +51,8 @@ class Densifier:
         self._seed, self._prune_opa, self._backend = config.seed, config.prune_opa, backend
         self._splats, self._optimizers = splats, optimizers
         self._stop = config.scaled(config.recipe.refine_stop_iter)
-        self.mcmc = Mcmc(config, scene.scene_scale) if config.strategy == "mcmc" else None
-        self._clear_views = ClearViews(scene, config.clear_depth)
+        self.mcmc = Mcmc(config, scene_scale) if config.strategy == "mcmc" else None
+        self._clear_views = clear_views
         count = len(splats["means"])
         if self.mcmc is not None and count > config.cap_max:
             log.warning(
@@ -63,7 +64,7 @@ class Densifier:
         if self.mcmc is None:
             self.strategy = create_strategy(config)
             self.strategy.check_sanity(splats, optimizers)
-            self.state = self.strategy.initialize_state(scene_scale=scene.scene_scale)
+            self.state = self.strategy.initialize_state(scene_scale=scene_scale)
 
     def before_backward(self, step: int, info: dict[str, Any]) -> None:
         """Ask for the gradients that densification averages.

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from skipgs_plug.host_copy import HostCopy
 from skipgs_plug.trainer import metrics, state
 from skipgs_plug.trainer.backend import Backend, resolve_backend, single_precision
+from skipgs_plug.trainer.clear_views import ClearViews
 from skipgs_plug.trainer.clock import TrainClock
 from skipgs_plug.trainer.config import TrainConfig
 from skipgs_plug.trainer.densifier import Densifier
@@ -23,7 +24,7 @@ from skipgs_plug.trainer.half_size import half_size
 from skipgs_plug.trainer.image_store import ReadAhead
 from skipgs_plug.trainer.iteration import Iteration
 from skipgs_plug.trainer.model import create_optimizers, create_splats, step_optimizers
-from skipgs_plug.trainer.near_plane import near_plane
+from skipgs_plug.trainer.near_plane import near_plane, nearest_depths
 from skipgs_plug.trainer.order import ViewOrder
 from skipgs_plug.trainer.photographs import Photographs
 from skipgs_plug.trainer.ply import write_ply
@@ -72,12 +73,14 @@ class Trainer:
         self.scene = scene
         self.backend = backend or resolve_backend(config.backend)
         self.max_steps = config.max_steps
-        self.near_plane = near_plane(config, scene)
+        depths = nearest_depths(scene.train, scene.points)
+        self.near_plane = near_plane(config, scene, depths)
         self.step = self.ran = 0
         self._since: int | None = None  # number after the previous iteration, set by `train`
         self._splats = create_splats(scene, config, self.backend.device, self.near_plane)
         self._optimizers = create_optimizers(self._splats, config, scene.scene_scale, self.backend)
-        self._densifier = Densifier(config, scene, self.backend, self._splats, self._optimizers)
+        clear = ClearViews(scene.train, depths, config.clear_depth)
+        self._densifier = Densifier(config, scene.scene_scale, clear, self.backend, self._splats, self._optimizers)
         self.mcmc, self.strategy = self._densifier.mcmc, self._densifier.strategy
         self.strategy_state = self._densifier.state
         self.refine_stop_iter = config.scaled(config.recipe.refine_stop_iter)

@@ -18,18 +18,24 @@ MOST = 20_000  # projected points, at most, which bounds the time; of more point
 SHARE_OF_EXTENT = 0.04
 
 
-def near_plane(config: TrainConfig, scene: Scene) -> float:
+def near_plane(config: TrainConfig, scene: Scene, depths: list[float | None] | None = None) -> float:
     """Return the near clipping plane in local units: that of the settings, or a tenth of the nearest points' depth.
 
     A Gaussian close to a camera covers its whole picture, and no other view shows that it is wrong. Nothing in a
     photograph is so near. A fixed distance cannot be right, since a COLMAP scene has no unit.
+
+    Args:
+        config: Settings.
+        scene: The scene.
+        depths: Result of `nearest_depths` for the training views; None if it is not known yet.
 
     Raises:
         InputError: The near plane is not below the far plane.
     """
     chosen = None if config.near_plane is None else config.near_plane / scene.frame.unit
     if chosen is None:
-        known = [depth for depth in nearest_depths(scene.train, scene.points) if depth is not None]
+        depths = nearest_depths(scene.train, scene.points) if depths is None else depths
+        known = [depth for depth in depths if depth is not None]
         chosen = SHARE * min(known) if known else SHARE_OF_EXTENT * scene.scene_scale
         chosen = max(chosen, TINY)
     if chosen >= far_plane(config, scene):

@@ -1,4 +1,4 @@
-"""Gaussians in front of a camera, nearer than anything that its view shows, are pruned while the scene grows."""
+"""Gaussians nearer to a camera than anything that its view shows are pruned while the scene grows."""
 
 from __future__ import annotations
 
@@ -31,22 +31,25 @@ PLACES = {
     "near the first camera": [1.0, 0.0, 0.5],
     "a little nearer than half of the depth": [-1.0, 0.0, 1.98],
     "a little farther": [-1.0, 0.0, 2.02],
-    "near the first camera, beside its picture": [1.4, 0.0, 0.5],
-    "behind": [1.0, 0.0, -0.5],
+    "beside its picture": [2.0, 0.0, 0.5],
+    "behind it": [1.0, 0.0, -0.98],
+    "farther behind": [1.0, 0.0, -1.02],
     "at the wall": [0.0, 0.0, 4.0],
 }
 
 
 def faded(scene: Scene, share: float, number: int = 0) -> list[str]:
     opacities = torch.zeros(len(PLACES))
-    ClearViews(scene, share).fade(torch.tensor(list(PLACES.values())), opacities, number)
+    ClearViews(scene.train, nearest_depths(scene.train, scene.points), share).fade(
+        torch.tensor(list(PLACES.values())), opacities, number
+    )
     assert opacities.unique().tolist() in ([FADED, 0.0], [0.0])
     return [place for place, opacity in zip(PLACES, opacities, strict=True) if opacity]
 
 
-def test_what_lies_in_a_picture_nearer_than_half_of_its_nearest_points_is_faded(two: Scene) -> None:
-    assert faded(two, 0.5) == ["near the first camera", "a little nearer than half of the depth"]
-    assert faded(two, 0.51)[1:] == ["a little nearer than half of the depth", "a little farther"]
+def test_what_is_nearer_than_half_of_the_nearest_points_or_around_a_camera_is_faded(two: Scene) -> None:
+    assert faded(two, 0.5) == ["near the first camera", "a little nearer than half of the depth", "behind it"]
+    assert faded(two, 0.511) == [*list(PLACES)[:3], "behind it", "farther behind"]
     assert faded(two, 0.0) == []
 
 
@@ -58,7 +61,7 @@ def test_a_view_without_points_has_no_limit(two: Scene) -> None:
 
 def test_many_views_take_turns(two: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clear_views, "MOST", 1)
-    assert faded(two, 0.5, number=6) == ["near the first camera"]
+    assert faded(two, 0.5, number=6) == ["near the first camera", "behind it"]
     assert faded(two, 0.5, number=7) == ["a little nearer than half of the depth"]
 
 

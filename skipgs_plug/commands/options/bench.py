@@ -24,8 +24,8 @@ class Options(TrainConfig):
     max_steps: int = 3000
     """Training iterations."""
     clear_depth: float = 0.0
-    """Densification prunes Gaussians in a view's picture that are nearer to its camera than this share of the depth of
-    its nearest points: they are haze. A bench compares with the plain recipe, which prunes none (0)."""
+    """Densification prunes Gaussians nearer to a camera than this share of the depth of the nearest points in its view:
+    they are haze. A bench compares with the plain recipe, which prunes none (0)."""
 
 
 @dataclass
