@@ -12,8 +12,14 @@ from skipgs_plug.trainer.metrics import chosen, measure
 
 
 def find_pictures(out: Path) -> Path:
-    """Return the newest folder of pictures in a script's output, as `measure_pictures` takes it."""
+    """Return the newest folder of pictures in a script's output, as `measure_pictures` takes it.
+
+    Raises:
+        FileNotFoundError: The script has written none.
+    """
     folders = [path.parent for path in out.rglob("gt") if path.is_dir()] + list(out.glob("renders"))
+    if not folders:
+        raise FileNotFoundError(f"There are no pictures of held-out views in {out}.")
     return max(folders, key=lambda path: path.stat().st_mtime)
 
 

@@ -141,7 +141,10 @@ def run(
     wall = time.perf_counter() - begun
     if one.render:
         render(one.render.format(**filled), checkouts / one.folder, folder / "render.txt")
-    judged = judge(one, folder, scene, data_factor)
+    try:
+        judged = judge(one, folder, scene, data_factor)
+    except FileNotFoundError as error:
+        sys.exit(f"{error} Nothing was recorded; the script's log is {folder / 'log.txt'}.")
     record = {
         "scene": named(scene, data_factor),
         "points_seed": json.loads((scene / DRAWN).read_text(encoding="utf-8"))["seed"],
@@ -205,8 +208,15 @@ def count_gaussians(folder: Path) -> int | None:
 
 
 def newest(folder: Path, pattern: str) -> Path:
-    """Return the newest of the files in a folder, and in folders inside it, that have such a name."""
-    return max(folder.rglob(pattern), key=lambda path: path.stat().st_mtime)
+    """Return the newest of the files in a folder, and in folders inside it, that have such a name.
+
+    Raises:
+        FileNotFoundError: There is none.
+    """
+    found = max(folder.rglob(pattern), key=lambda path: path.stat().st_mtime, default=None)
+    if found is None:
+        raise FileNotFoundError(f"There is no {pattern} in {folder}.")
+    return found
 
 
 def facts(folder: Path, iterations: int) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 log = logging.getLogger(__name__)
 
+BENCH_SETTINGS = "settings.json"  # first file of a bench, which has a folder of its own
 OUT_OF_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 LEFTOVER = re.compile(r"\..+\.\d+(\.tmp)?")
 

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from skipgs_plug.bench.record import RunRecord
+from skipgs_plug.files import BENCH_SETTINGS
 from skipgs_plug.trainer import InputError
 from skipgs_plug.trainer.files import write_aside, write_json
-from skipgs_plug.trainer.run_folder import BENCH_SETTINGS, RunFolder
+from skipgs_plug.trainer.run_folder import RunFolder
 
 
 class BenchFolder:

@@ -10,6 +10,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from skipgs_plug.commands.options.render import Args
+from skipgs_plug.trainer.backend import resolve_backend
 from skipgs_plug.trainer.errors import InputError
 from skipgs_plug.trainer.scene import View
 from skipgs_plug.view.draw import Painter, colour_depth, depth_range, to_bytes
@@ -31,6 +32,7 @@ def run(args: Args) -> int:
     out = args.out.expanduser()
     if out.suffix.lower() not in ("", ".mp4"):
         raise InputError(f"{out} is neither a film (.mp4) nor a folder; give one of the two.")
+    resolve_backend(args.backend)  # refused before the scene is read, which can take minutes
     model = open_model(args.model, args.scene, args.data_factor)
     if model.scene is None:
         raise InputError(f"{args.model} names no cameras to render from; add --scene with the scene it shows.")

@@ -15,7 +15,7 @@ from skipgs_plug.commands.names import require_folder
 from skipgs_plug.commands.options.sfm import Args as SfmArgs
 from skipgs_plug.commands.options.train import Args
 from skipgs_plug.commands.session import Session
-from skipgs_plug.files import write_aside
+from skipgs_plug.files import BENCH_SETTINGS, write_aside
 from skipgs_plug.garbage import uncollected
 from skipgs_plug.install import next_command
 from skipgs_plug.photos.gather import are_photographs
@@ -31,7 +31,7 @@ from skipgs_plug.trainer.lock import exclusive
 from skipgs_plug.trainer.metrics import require_lpips
 from skipgs_plug.trainer.ply import read_start
 from skipgs_plug.trainer.resume import first_sound, lengths
-from skipgs_plug.trainer.run_folder import BENCH_SETTINGS, SCENE, RunFolder
+from skipgs_plug.trainer.run_folder import SCENE, RunFolder
 from skipgs_plug.trainer.scene import all_held_out
 from skipgs_plug.view.spz import to_spz
 

@@ -14,7 +14,7 @@ from skipgs_plug.bench.result import KIND
 from skipgs_plug.bench.result import SCHEMA_VERSION as BENCH_VERSION
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.report import SCHEMA_VERSION as RUN_VERSION
-from skipgs_plug.files import printable
+from skipgs_plug.files import BENCH_SETTINGS, printable
 
 RUN_FIELDS = (
     "settings",
@@ -118,7 +118,7 @@ def read_source(path: str | Path) -> RunSource | BenchSource:
         file = folder / "bench.json" if (folder / "bench.json").is_file() else folder / "skipgs.json"
     name = printable(folder.resolve().name)
     if not file.is_file():
-        if (folder / "settings.json").is_file() and (folder / "runs").is_dir():
+        if (folder / BENCH_SETTINGS).is_file() and (folder / "runs").is_dir():
             raise SkipGSError(f"{folder} holds a bench that has not finished; repeat its command to continue it.")
         run = read_run(name, folder, None)
         if not run.metrics and not run.curve:

@@ -23,7 +23,6 @@ from skipgs_plug.trainer.scene import View
 CHECKPOINT = re.compile(r"ckpt_(\d+)_rank0\.pt")
 SCENE = "scene"  # subfolder with the scene that `train --sfm` reconstructed
 RESULTS = ("ply/point_cloud_*.ply", "skipgs.json", "stats/*.json", "renders/*_step*.png")
-BENCH_SETTINGS = "settings.json"  # first file of a bench, which has a folder of its own
 KEPT = 2  # checkpoints to keep: the older one serves if the last is damaged
 MOST_WAITING = 2  # renders that may wait for a slow disk, which bounds memory
 FOLDERS = ("", "ckpts", "ply", "stats", "renders")

@@ -82,6 +82,16 @@ def test_script_that_fails_is_named_with_its_log(checkouts, monkeypatch, capsys)
     assert "The script ended with 3; its log is " in capsys.readouterr().err
 
 
+def test_script_without_pictures_or_a_model_records_nothing(checkouts, monkeypatch):
+    (checkouts.parent / "ready/renders/val_step99_0000.png").unlink()
+    (checkouts.parent / "ready/renders").rmdir()
+    with pytest.raises(SystemExit, match=r"no pictures of held-out views in .*Nothing was recorded; .*log\.txt"):
+        run(checkouts, monkeypatch)
+    assert not (checkouts.parent / "runs.json").exists()
+    with pytest.raises(FileNotFoundError, match="no point_cloud"):
+        unmodified_scripts.newest(checkouts, "point_cloud*.ply")
+
+
 def test_pictures_that_another_command_renders_and_gaussians_of_a_checkpoint_are_recorded(checkouts, monkeypatch):
     model = checkouts.parent / "ready/run/model/step-000000099.ckpt"
     model.parent.mkdir(parents=True)
