@@ -159,7 +159,7 @@ class TrainConfig:
     """Far clipping plane, world units."""
     clear_depth: float = 0.5
     """Densification prunes Gaussians nearer to a camera than this share of the depth of the nearest points in its view:
-    they are haze. 0 prunes none, as the plain recipe."""
+    they are haze in captures of up to 100 views. 0 prunes none, as the plain recipe."""
 
     strategy: Literal["default", "mcmc"] = "default"
     """Densification: gsplat's DefaultStrategy (clone, split, prune) or MCMCStrategy (move, up to cap_max)."""

@@ -99,20 +99,17 @@ class Densifier:
             self.strategy.step_post_backward(*args, info, packed=info["gaussian_ids"] is not None)
         else:
             self._backend.catch_up(self._optimizers)
-            self._fade(step)
+            self._clear_views.fade(self._splats["means"], self._splats["opacities"])
             with seeded(derive_seed(self._seed, step), self._backend.device):
                 densify(self.strategy, *args, info, in_order=sorts_rows(self.strategy, step))
             require_some(len(self._splats["means"]) > 0, step, "lower prune_opa or raise prune_scale3d")
         reset_opacity_if_missed(self.strategy, *args)
 
-    def _fade(self, step: int) -> None:
-        self._clear_views.fade(self._splats["means"], self._splats["opacities"], derive_seed(self._seed, step))
-
     def _move(self, mcmc: Mcmc, step: int, updated: bool) -> None:
         # The noise belongs to the update: without an update it is a random walk.
         moves = mcmc.moves(step)
         if moves:
-            self._fade(step)
+            self._clear_views.fade(self._splats["means"], self._splats["opacities"])
             alive = self._splats["opacities"].detach().sigmoid() > self._prune_opa  # others move to them
             require_some(bool(alive.any()), step, "lower prune_opa")
             self._backend.release_memory()  # gsplat copies all rows

@@ -38,11 +38,10 @@ PLACES = {
 }
 
 
-def faded(scene: Scene, share: float, number: int = 0) -> list[str]:
+def faded(scene: Scene, share: float) -> list[str]:
     opacities = torch.zeros(len(PLACES))
-    ClearViews(scene.train, nearest_depths(scene.train, scene.points), share).fade(
-        torch.tensor(list(PLACES.values())), opacities, number
-    )
+    clear = ClearViews(scene.train, nearest_depths(scene.train, scene.points), share)
+    clear.fade(torch.tensor(list(PLACES.values())), opacities)
     assert opacities.unique().tolist() in ([FADED, 0.0], [0.0])
     return [place for place, opacity in zip(PLACES, opacities, strict=True) if opacity]
 
@@ -59,10 +58,9 @@ def test_a_view_without_points_has_no_limit(two: Scene) -> None:
     assert faded(two, 0.5) == ["a little nearer than half of the depth"]
 
 
-def test_many_views_take_turns(two: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clear_views, "MOST", 1)
-    assert faded(two, 0.5, number=6) == ["near the first camera", "behind it"]
-    assert faded(two, 0.5, number=7) == ["a little nearer than half of the depth"]
+def test_many_views_correct_each_other(two: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clear_views, "FEW", 1)
+    assert faded(two, 0.5) == []
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
