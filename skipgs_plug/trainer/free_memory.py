@@ -3,33 +3,32 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import NamedTuple
 
-MEMINFO, GROUPS = "proc/meminfo", "proc/self/cgroup"
+from skipgs_plug.control_groups import groups_of_process
+
+MEMINFO = "proc/meminfo"
 UNKNOWN = 8 << 30  # bytes of free memory assumed on systems that do not report it, such as macOS and Windows
 
 
 class Version(NamedTuple):
-    """Where a version of control groups has its groups, and the names of the files in each.
+    """The names of the files in each group of a version of control groups.
 
     Attributes:
         controller: Name in the list of the process's groups; version 2 has none.
-        root: Folder of the uppermost group.
         limit, used: Files with the allowed and the used bytes. A limit can be "max".
         cache: Entry of memory.stat: bytes of files that the kernel drops when memory is needed. They count as used.
     """
 
     controller: str
-    root: str
     limit: str
     used: str
     cache: str
 
 
-V2 = Version("", "sys/fs/cgroup", "memory.max", "memory.current", "inactive_file")
-V1 = Version("memory", "sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+V2 = Version("", "memory.max", "memory.current", "inactive_file")
+V1 = Version("memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
 
 
 def free_memory(root: Path = Path("/")) -> int:
@@ -38,7 +37,8 @@ def free_memory(root: Path = Path("/")) -> int:
     Args:
         root: Folder with `proc` and `sys` of the kernel.
     """
-    sizes = [_available(root), *(_left(group, version) for version in (V2, V1) for group in _groups(root, version))]
+    groups = [(group, version) for version in (V2, V1) for group in groups_of_process(root, version.controller)]
+    sizes = [_available(root), *(_left(group, version) for group, version in groups)]
     return min((size for size in sizes if size is not None), default=UNKNOWN)
 
 
@@ -47,18 +47,6 @@ def _available(root: Path) -> int | None:
         return _entry(root / MEMINFO, "MemAvailable:") * 1024
     except (OSError, ValueError):
         return None
-
-
-def _groups(root: Path, version: Version) -> Iterator[Path]:
-    """Return the folders of the groups that hold this process, from the innermost on. Each can have a limit."""
-    try:
-        lines = [line.split(":", 2) for line in (root / GROUPS).read_text().splitlines()]
-        name = next(path for _, controllers, path in lines if version.controller in controllers.split(","))
-    except (OSError, ValueError, StopIteration):
-        name = "/"
-    inner = PurePosixPath(name.lstrip("/"))
-    # A container can show its own group as the uppermost one, and a name that has no folder in it.
-    return (root / version.root / group for group in (inner, *inner.parents))
 
 
 def _left(group: Path, version: Version) -> int | None:

@@ -1,4 +1,4 @@
-"""The number of cores that this process may use: its affinity mask, limited by the quota of its control group."""
+"""The number of cores that this process may use: its affinity mask, limited by the quotas of its control groups."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import math
 import os
 from pathlib import Path
 
-CGROUP_V2 = "sys/fs/cgroup/cpu.max"  # "quota period" in microseconds, or "max period"
-CGROUP_V1 = ("sys/fs/cgroup/cpu/cpu.cfs_quota_us", "sys/fs/cgroup/cpu/cpu.cfs_period_us")
+from skipgs_plug.control_groups import groups_of_process
+
+V2 = "cpu.max"  # "quota period" in microseconds, or "max period"
+V1 = ("cpu.cfs_quota_us", "cpu.cfs_period_us")
 
 
 def usable_cores(root: Path = Path("/")) -> int:
@@ -20,17 +22,19 @@ def usable_cores(root: Path = Path("/")) -> int:
         root: Root folder of the operating system's files.
     """
     bound = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    quota = _quota(root)
-    return bound if quota is None else max(1, min(bound, math.ceil(quota)))
+    groups = [
+        (group, names)
+        for names, controller in (((V2,), ""), (V1, "cpu"))
+        for group in groups_of_process(root, controller)
+    ]
+    quotas = [quota for quota in (_quota(group, names) for group, names in groups) if quota is not None]
+    return max(1, min([bound, *map(math.ceil, quotas)]))
 
 
-def _quota(root: Path) -> float | None:
-    """Return the CPUs that the control group grants. None if there is no limit, or if it cannot be read."""
+def _quota(group: Path, names: tuple[str, ...]) -> float | None:
+    """Return the CPUs that a group grants, by the files with these names. None if it has no limit."""
     try:
-        if (root / CGROUP_V2).is_file():
-            quota, period = (root / CGROUP_V2).read_text().split()
-        else:
-            quota, period = ((root / name).read_text().strip() for name in CGROUP_V1)
+        quota, period = " ".join((group / name).read_text() for name in names).split()
         granted = float(quota) / float(period)
     except (OSError, ValueError, ZeroDivisionError):
         return None
