@@ -366,11 +366,11 @@ class Engine:
         state = whole.get("pace")
         if (state is None) == self.pace.leaves_out:
             raise other_shares(state, self.config)
+        if state is not None:
+            self.pace.load_state_dict(state)  # first, since it can refuse the state
         if "visibility" in whole:
             self.rates.visibility.load_state_dict(whole["visibility"])
             self.rates.sizes.load_state_dict(whole["size_bound"])
-        if state is not None:
-            self.pace.load_state_dict(state)
 
     def _agreed(self, view: str, loss: float, step: int, signal: float | Tensor | HostCopy) -> Decision:
         if distributed.group_size() == 1:
