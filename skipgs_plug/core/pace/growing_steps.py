@@ -9,6 +9,7 @@ from skipgs_plug.core.pace.needs import (
     LONGEST_STEPS_OF_POSITIONS_THAT_STAY,
     LONGEST_STEPS_OF_SCALES,
     SELDOM_SHOWN,
+    for_new_gaussians,
     geometry_part,
     growing_factor,
     opacity_factor,
@@ -38,6 +39,8 @@ def longer_steps(
         return factor, GrowingParts(opacities, 1.0, 0.0, events.clears_moments)
     scales = GEOMETRY if plan.reset is None else geometry_part(factor, LONGEST_STEPS_OF_SCALES)
     far = (plan.reset is not None and not fading) or not events.resets
+    if plan.unrefined and for_new_gaussians(times_grown) > 1.0:  # its growth does not slow down otherwise
+        far = False
     positions = geometry_part(factor, LONGEST_STEPS_OF_POSITIONS if far else LONGEST_STEPS_OF_POSITIONS_THAT_STAY)
     if plan.unrefined and not fading and not plan.steps_after:
         return factor, GrowingParts(opacities, positions, scales, True, HIGHEST_OPACITY_RATE)
