@@ -21,8 +21,8 @@ from torch.overrides import TorchFunctionMode
 
 from skipgs_plug.compat.child_processes import also_in_children
 from skipgs_plug.compat.stand_ins import stand_ins
+from skipgs_plug.limits import free_memory
 from skipgs_plug.scripts.threads import also_in_threads
-from skipgs_plug.trainer.free_memory import free_memory
 
 DEVICE_NAME = "CPU"
 

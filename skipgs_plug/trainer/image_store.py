@@ -15,7 +15,7 @@ from typing import TypeVar
 from torch import Tensor
 
 from skipgs_plug.fallback_raster import usable_cores
-from skipgs_plug.trainer.free_memory import free_memory
+from skipgs_plug.limits import free_memory
 from skipgs_plug.trainer.order import ViewOrder
 from skipgs_plug.trainer.scene import View
 

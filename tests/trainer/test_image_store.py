@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 from scene_folders import write_colmap
 
+from skipgs_plug.limits import UNKNOWN, V1, V2, free_memory
 from skipgs_plug.trainer import InputError, Scene, TrainConfig, Trainer, load_scene
-from skipgs_plug.trainer.free_memory import UNKNOWN, V1, V2, free_memory
 from skipgs_plug.trainer.image_store import ImageStore, StreamedView, one_by_one
 
 PICTURE = 32 * 24 * 4  # bytes of a photograph and its mask

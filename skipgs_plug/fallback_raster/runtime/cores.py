@@ -6,7 +6,7 @@ import math
 import os
 from pathlib import Path
 
-from skipgs_plug.control_groups import groups_of_process
+from skipgs_plug.limits import groups_of_process
 
 V2 = "cpu.max"  # "quota period" in microseconds, or "max period"
 V1 = ("cpu.cfs_quota_us", "cpu.cfs_period_us")

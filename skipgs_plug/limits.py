@@ -1,14 +1,14 @@
-"""Memory that is left for this process: free memory of the machine, bounded by its control groups."""
+"""Limits of this process: the control groups that hold it, and the memory that they leave of the machine's."""
 
 from __future__ import annotations
 
 import contextlib
-from pathlib import Path
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-from skipgs_plug.control_groups import groups_of_process
-
-MEMINFO = "proc/meminfo"
+MEMINFO, GROUPS = "proc/meminfo", "proc/self/cgroup"
+ROOT = "sys/fs/cgroup"  # groups of version 2; version 1 has a folder for each controller in it
 UNKNOWN = 8 << 30  # bytes of free memory assumed on systems that do not report it, such as macOS and Windows
 
 
@@ -40,6 +40,23 @@ def free_memory(root: Path = Path("/")) -> int:
     groups = [(group, version) for version in (V2, V1) for group in groups_of_process(root, version.controller)]
     sizes = [_available(root), *(_left(group, version) for group, version in groups)]
     return min((size for size in sizes if size is not None), default=UNKNOWN)
+
+
+def groups_of_process(root: Path, controller: str = "") -> Iterator[Path]:
+    """Yield the folders of the groups that hold this process, from the innermost on. Each can have a limit.
+
+    Args:
+        root: Folder with `proc` and `sys` of the kernel.
+        controller: Name of a controller of version 1; empty for version 2.
+    """
+    try:
+        lines = [line.split(":", 2) for line in (root / GROUPS).read_text().splitlines()]
+        name = next(path for _, controllers, path in lines if controller in controllers.split(","))
+    except (OSError, ValueError, StopIteration):
+        name = "/"
+    inner = PurePosixPath(name.lstrip("/"))
+    # A container can show its own group as the uppermost one, and a name that has no folder in it.
+    return (root / ROOT / controller / group for group in (inner, *inner.parents))
 
 
 def _available(root: Path) -> int | None:
