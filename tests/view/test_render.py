@@ -49,6 +49,12 @@ def test_a_missing_package_is_one_sentence(module, sentence, run_folder, tmp_pat
     assert not any(tmp_path.iterdir())
 
 
+def test_a_backend_that_cannot_render_is_refused_before_the_model_is_opened(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "warp", None)
+    assert main(["render", str(tmp_path / "no_such_run"), str(tmp_path / "film.mp4"), "--backend", "warp"]) == 2
+    assert "Backend warp needs NVIDIA Warp" in capsys.readouterr().err
+
+
 def test_held_out_pictures_are_what_the_trainer_renders(run_folder, scene_file, tmp_path):
     out = tmp_path / "held_out"
     assert main(["render", str(run_folder), str(out), "--cameras", "held-out", "--no-progress"]) == 0
