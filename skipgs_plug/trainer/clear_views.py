@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -34,7 +36,7 @@ class ClearViews:
 
     def __init__(self, views: list[View], depths: list[float | None], share: float) -> None:
         pairs = zip(views, depths, strict=True) if share and len(views) <= FEW else ()
-        self._limited = [(view, share * depth) for view, depth in pairs if depth is not None]
+        self._limited = [_LimitedView.of(view, share * depth) for view, depth in pairs if depth is not None]
 
     @torch.no_grad()
     def fade(self, means: Tensor, opacities: Tensor) -> None:
@@ -47,9 +49,7 @@ class ClearViews:
         if not self._limited:
             return
         squares = (means * means).sum(dim=1)
-        for view, limit in self._limited:
-            camera = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
-            reach = (limit * _longest_ray(view)) ** 2 - float(camera @ camera)
+        for view, limit, camera, reach in self._limited:
             close = (torch.addmv(squares, means, -2.0 * camera.to(means)) < reach).nonzero()[:, 0]
             if not len(close):
                 continue
@@ -60,8 +60,26 @@ class ClearViews:
             opacities.index_fill_(0, close[near.to(close.device)], FADED)
 
 
-def _longest_ray(view: View) -> float:
-    """Return the distance from the camera to the farthest corner of the picture's plane at a depth of 1."""
-    w, h = float(view.width), float(view.height)
-    corners = torch.tensor([[0.0, w, 0.0, w], [0.0, 0.0, h, h], [1.0] * 4], dtype=torch.float64)
-    return float(torch.linalg.solve(view.K.double(), corners).norm(dim=0).max())
+class _LimitedView(NamedTuple):
+    """A view, and the constants that tell which Gaussians are near its camera.
+
+    Attributes:
+        view: The view.
+        limit: Least depth of a Gaussian in its picture.
+        camera: Position [3] of the camera.
+        reach: For positions x that can be in the picture nearer than the limit, x @ x - 2 * x @ camera is less.
+    """
+
+    view: View
+    limit: float
+    camera: Tensor
+    reach: float
+
+    @classmethod
+    def of(cls, view: View, limit: float) -> _LimitedView:
+        """Return a view with a limit."""
+        camera = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+        w, h = float(view.width), float(view.height)
+        corners = torch.tensor([[0.0, w, 0.0, w], [0.0, 0.0, h, h], [1.0] * 4], dtype=torch.float64)
+        farthest = float(torch.linalg.solve(view.K.double(), corners).norm(dim=0).max())  # corner, at a depth of 1
+        return cls(view, limit, camera, (limit * farthest) ** 2 - float(camera @ camera))
