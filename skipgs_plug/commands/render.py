@@ -32,7 +32,7 @@ def run(args: Args) -> int:
     out = args.out.expanduser()
     if out.suffix.lower() not in ("", ".mp4"):
         raise InputError(f"{out} is neither a film (.mp4) nor a folder; give one of the two.")
-    resolve_backend(args.backend)  # refused before the scene is read, which can take minutes
+    backend = resolve_backend(args.backend)  # refused before the scene is read, which can take minutes
     model = open_model(args.model, args.scene, args.data_factor)
     if model.scene is None:
         raise InputError(f"{args.model} names no cameras to render from; add --scene with the scene it shows.")
@@ -41,7 +41,7 @@ def run(args: Args) -> int:
     if args.cameras == "held-out" and not held_out:
         raise InputError(f"Scene {model.scene.name} holds out no view; use --cameras path.")
     splats = model.load(model.snapshots[-1])
-    painter = Painter.of(model, args.backend)
+    painter = Painter.of(model, backend)
 
     if args.cameras == "path":
         lens = train[0]

@@ -9,6 +9,7 @@ import threading
 from torch import Tensor
 
 from skipgs_plug.commands.options.view import Args
+from skipgs_plug.trainer.backend import Backend, resolve_backend
 from skipgs_plug.trainer.exposure import fit_colours
 from skipgs_plug.trainer.scene import View
 from skipgs_plug.view.draw import Painter
@@ -24,7 +25,7 @@ ELSEWHERE = {"0.0.0.0": (socket.AF_INET, "192.0.2.1"), "::": (socket.AF_INET6, "
 class Draw:
     """Renders a model with the exposure of its photographs."""
 
-    def __init__(self, model: Model, backend: str) -> None:
+    def __init__(self, model: Model, backend: Backend) -> None:
         self._model, self._painter = model, Painter.of(model, backend)
 
     def __call__(self, splats: Splats, view: View) -> Tensor:
@@ -37,8 +38,9 @@ class Draw:
 
 def run(args: Args) -> int:
     """Serve the page; see `Args`."""
+    backend = resolve_backend(args.backend)  # refused before the scene is read, which can take minutes
     model = open_model(args.model, args.scene, args.data_factor)
-    draw = Draw(model, args.backend)
+    draw = Draw(model, backend)
     with contextlib.suppress(KeyboardInterrupt):
         (serve_cameras if args.cameras else serve_model)(model, draw, args)
     return 0

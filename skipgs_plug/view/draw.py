@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skipgs_plug.trainer.backend import Backend, resolve_backend, single_precision
+from skipgs_plug.trainer.backend import Backend, single_precision
 from skipgs_plug.trainer.ply import sh_degree
 from skipgs_plug.view.model import Model
 
@@ -40,10 +40,10 @@ class Painter:
         self._mode = "antialiased" if antialiased else "classic"
 
     @classmethod
-    def of(cls, model: Model, backend: str) -> Painter:
-        """Return a painter with the settings of the model's training, on the backend with this name."""
+    def of(cls, model: Model, backend: Backend) -> Painter:
+        """Return a painter with the settings of the model's training."""
         settings = model.background, model.near_plane, model.antialiased, model.far_plane
-        return cls(resolve_backend(backend), *settings)
+        return cls(backend, *settings)
 
     @torch.no_grad()
     @single_precision()

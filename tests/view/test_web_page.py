@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from skipgs_plug.commands.view import Draw
 from skipgs_plug.fallback_raster.oracle.torch_reference_projection import spherical_harmonics
+from skipgs_plug.trainer.backend import resolve_backend
 from skipgs_plug.view.model import open_model
 from skipgs_plug.view.web.rotate_model import rotated, rotated_harmonics, upright
 from skipgs_plug.view.web.server import WebPage
@@ -30,7 +31,7 @@ pytestmark = pytest.mark.timeout(600)
 @pytest.fixture(scope="module")
 def page(run_folder: Path) -> Iterator[WebPage]:
     model = open_model(run_folder)
-    served = WebPage(model, model.load(model.snapshots[-1]), Draw(model, "warp"), "127.0.0.1", 18511)
+    served = WebPage(model, model.load(model.snapshots[-1]), Draw(model, resolve_backend("warp")), "127.0.0.1", 18511)
     threading.Thread(target=served.prepare).start()
     yield served
     served.stop()
