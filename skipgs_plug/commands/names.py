@@ -11,7 +11,9 @@ from skipgs_plug.trainer.errors import InputError
 def require_folder(out: str) -> None:
     """Raise InputError if a folder cannot be made, before hours of work for it."""
     folder = Path(out).expanduser().absolute()
-    nearest = next(place for place in (folder, *folder.parents) if place.exists())
+    nearest = next(place for place in (folder, *folder.parents) if os.path.lexists(place))
+    if not nearest.exists():
+        raise InputError(f"--out {out}: {nearest} is a link to nothing; remove it or give another --out.")
     if not nearest.is_dir():
         raise InputError(f"--out {out}: {nearest} is a file; give the name of a folder.")
     if not os.access(nearest, os.W_OK):

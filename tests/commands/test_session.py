@@ -320,18 +320,28 @@ def test_two_processes_do_not_share_a_folder(tmp_path: Path, packed: str, capsys
     assert not (tmp_path / ".owner.json").exists()
 
 
-@pytest.mark.parametrize("out", ["file", "file/run", "closed/run"])
+@pytest.mark.parametrize("out", ["file", "file/run", "closed/run", "link", "link/run"])
 def test_a_folder_that_cannot_be_written_is_one_sentence_before_the_scene_is_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, out: str
 ) -> None:
     (tmp_path / "file").write_text("")
     (tmp_path / "closed").mkdir()
+    (tmp_path / "link").symlink_to("nowhere")
     monkeypatch.setattr(os, "access", lambda path, mode: path.name != "closed")  # root may write everywhere
     assert train("no scene", tmp_path / out) == 2
     error = capsys.readouterr().err
-    fault = "cannot be written" if out == "closed/run" else "is a file"
-    assert f"{tmp_path / out.split('/')[0]} {fault}" in error and len(error.splitlines()) == 1
-    assert not (tmp_path / "closed/run").exists()
+    place = out.split("/")[0]
+    fault = {"file": "is a file", "closed": "cannot be written", "link": "is a link to nothing"}[place]
+    assert f"{tmp_path / place} {fault}" in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "closed/run").exists() and not (tmp_path / "nowhere").exists()
+
+
+def test_photographs_too_small_to_be_halved_are_refused_before_a_folder_is_made(
+    tmp_path: Path, packed: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("skipgs_plug.adapters.reference_trainer.can_be_halved", lambda height, width: False)
+    assert main(["train", packed, "--out", str(tmp_path / "run"), "--share", "0.5", "--half-size", "True"]) == 2
+    assert "half_size is not possible here" in capsys.readouterr().err and not (tmp_path / "run").exists()
 
 
 def test_a_run_folder_that_vanishes_is_made_anew(

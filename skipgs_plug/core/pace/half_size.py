@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import Any
+
+from torch import Tensor
 
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import SkipGSError
 from skipgs_plug.core.half_size import Kept, kept_at_half_size
 from skipgs_plug.core.pace.phase import PhasePlan
+
+
+def require_half_size(config: SkipConfig, photographs: Callable[[], Iterable[Tensor]] | None) -> None:
+    """Raise SkipGSError if the user asked for photographs of half the size, and they are not possible.
+
+    Args:
+        config: Settings with `half_size`.
+        photographs: Returns some of them; None if views cannot be shown at half their size; see `TrainerInfo`.
+    """
+    if config.half_size and config.may_halve and photographs is None:
+        raise SkipGSError(
+            "half_size is not possible here: the adapter of this trainer does not show its views at half their size, "
+            "or they are too small; leave it out."
+        )
 
 
 class HalfSize:
@@ -27,24 +44,15 @@ class HalfSize:
         self.kept: Kept | None = None
 
     def begin(self, plan: PhasePlan) -> None:
-        """Decide, unless a saved state did. All processes must call it together.
-
-        Raises:
-            SkipGSError: The user asked for it, and it is not possible.
-        """
+        """Decide, unless a saved state did. All processes must call it together."""
         if self.until is None:
             self.until = min(plan.numbers.stop, (plan.last + 1) // 2) if self._pays(plan) else 0
 
     def _pays(self, plan: PhasePlan) -> bool:
-        if plan.photographs is None:
-            if self._config.half_size:
-                raise SkipGSError(
-                    "half_size is not possible here: the adapter of this trainer does not show its views at half their "
-                    "size, or they are too small; leave it out."
-                )
+        if plan.photographs is None or not self._config.may_halve:
             return False
-        if not self._config.may_halve or self._config.half_size:
-            return self._config.may_halve
+        if self._config.half_size:
+            return True
         self.kept = kept_at_half_size(plan.photographs)
         return self.kept.enough
 

@@ -10,6 +10,7 @@ from skipgs_plug.core.config import SkipConfig, shares_as_given
 from skipgs_plug.core.errors import GateStateError, SkipGSError
 from skipgs_plug.core.pace.base import Always, Known, Pace, Source, nothing_always, nothing_known
 from skipgs_plug.core.pace.growing import Growing
+from skipgs_plug.core.pace.half_size import require_half_size
 from skipgs_plug.core.pace.loop_facts import LoopFacts
 from skipgs_plug.core.pace.loop_finder import LoopFinder
 from skipgs_plug.core.pace.loop_range import LoopRange
@@ -56,6 +57,7 @@ class Phased(Pace):
     # Facts about the trainer.
 
     def configure(self, start: int, info: TrainerInfo, views: list[str] | None) -> None:
+        require_half_size(self._config, info.photographs)
         self._facts.configure(start, info, views)
         self._configured = True
 
