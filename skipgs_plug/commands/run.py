@@ -29,6 +29,7 @@ from skipgs_plug.scripts.checkpoints import REPLACED, Checkpoints
 from skipgs_plug.scripts.cuda_redirect import REPLACED as CUDA_REPLACED
 from skipgs_plug.scripts.cuda_redirect import cuda_on_cpu, exclusive_cores
 from skipgs_plug.scripts.exits import before_process_ends
+from skipgs_plug.scripts.kept_memory import freed_memory_kept
 from skipgs_plug.scripts.launch import Attach, run_script, source_of
 from skipgs_plug.scripts.processes import Beginning, told_if_it_starts_itself, told_if_it_trains
 
@@ -225,5 +226,5 @@ def cpu_instead_of_cuda(args: Args, command: Sequence[str]) -> Iterator[None]:
             f"--cpu has no stand-in for the rasterizer of {args.adapter!r}: run {script_name(command)} with CUDA, "
             "without --cpu."
         )
-    with serve(family), cuda_on_cpu(), exclusive_cores(), instead_of_torchs_adam():
+    with serve(family), cuda_on_cpu(), exclusive_cores(), freed_memory_kept(), instead_of_torchs_adam():
         yield
