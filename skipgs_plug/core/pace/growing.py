@@ -13,9 +13,9 @@ from skipgs_plug.core.pace.growing_steps import longer_steps
 from skipgs_plug.core.pace.half_size import HalfSize
 from skipgs_plug.core.pace.needs import (
     LAST_FACTOR,
-    MOST_RAISED_SHARE,
     for_new_gaussians,
     growing_share,
+    most_raised,
     opacity_factor,
     opacity_rate,
     share_after_event,
@@ -198,10 +198,11 @@ class Growing(Phase):
             self._share_now = max(self.share, wanted) if self._has_room(plan, number) else self.share
 
     def _has_room(self, plan: GrowingPlan, number: int) -> bool:
-        """Whether more iterations than `share` can run from `number` on, by `MOST_RAISED_SHARE` of the phase."""
+        """Whether more iterations than `share` can run from `number` on, by `most_raised`."""
         assert self.share is not None
         left = plan.length - (number - plan.first)
-        return self.sampling.run + self.share * left < MOST_RAISED_SHARE * plan.length
+        most = most_raised(plan.length, self.stretch, plan.slow_positions)
+        return self.sampling.run + self.share * left < most * plan.length
 
     def _needed(self, plan: GrowingPlan, number: int) -> int:
         """Return the number of iterations that must run before the event in iteration `number`."""

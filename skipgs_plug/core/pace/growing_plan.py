@@ -29,6 +29,7 @@ class GrowingPlan(NamedTuple):
         unrefined: Whether the run ends before it makes up for the growing phase.
         steps_after: Number of iterations that will run in the following phase.
         random_points: Whether the points are random; None if the trainer does not say.
+        slow_positions: See `TrainerInfo`.
     """
 
     events: DensificationEvents
@@ -45,6 +46,7 @@ class GrowingPlan(NamedTuple):
     unrefined: bool
     steps_after: int
     random_points: bool | None
+    slow_positions: bool
 
     @property
     def all_must(self) -> bool:
@@ -114,6 +116,7 @@ def plan_growing(plan: PhasePlan, config: SkipConfig, first: int | None) -> Grow
         unrefined=unrefined,
         steps_after=_steps_after(plan, config, following),
         random_points=plan.random_points,
+        slow_positions=plan.slow_positions,
     )
 
 

@@ -10,7 +10,7 @@ from skipgs_plug.core import distributed
 from skipgs_plug.core.config import SkipConfig
 from skipgs_plug.core.errors import GateStateError
 from skipgs_plug.core.pace.early_stopping import CYCLE_ENDS, ONE_CYCLE, EarlyStopping, watched_views, why_none_watched
-from skipgs_plug.core.pace.needs import longest_positions, raised_share, refining_share
+from skipgs_plug.core.pace.needs import longest_positions, most_raised, raised_share, refining_share
 from skipgs_plug.core.pace.phase import NAMED_FOR_TRAINER, Phase, PhasePlan
 from skipgs_plug.core.pace.rates import ScaledRates, path_factor
 from skipgs_plug.core.pace.recovery import Recovery
@@ -62,7 +62,7 @@ class Refining(Phase):
         self._shrinks = False  # whether the steps, as many as in the trainer's own run, shrink with its schedule
         self._before = Phase()
         self._grown_by_few = False
-        self._first_positions_rate = 0.0  # see `TrainerInfo`
+        self._first_positions_rate, self._slow_positions = 0.0, False  # see `TrainerInfo`
         self._epoch: int | None = None
         self._begun = self._entered = self._removed = False
 
@@ -90,6 +90,7 @@ class Refining(Phase):
         grown = plan.before.shortened(self._first)
         self._begun, self._last, self._before, self._grown_by_few = True, plan.last, plan.before, grown > 0
         self._first_positions_rate, self._epoch = plan.positions_rate, plan.epoch
+        self._slow_positions = plan.slow_positions
         reasons = {**plan.conditions, NAMED_FOR_TRAINER: plan.named}
         self.always = {reason: hits for reason, hits in reasons.items() if hits}
         self._must = frozenset().union(*self.always.values())
@@ -131,7 +132,10 @@ class Refining(Phase):
         self._before.end()
         assert self.share is not None
         if self._auto:
-            self.share = raised_share(self.share, self.share * self._before.stretch)
+            assert self._first is not None and self._last is not None
+            stretch = self._before.stretch
+            most = most_raised(self._last + 1 - self._first, stretch, self._slow_positions)
+            self.share = raised_share(self.share, self.share * stretch, most)
             if self.stopping is None:
                 self.sampling.share = self.share
 

@@ -9,9 +9,10 @@ import torch
 
 from skipgs_plug import SkipGate, SkipGSError
 from skipgs_plug.core.caution import GateWarning
-from skipgs_plug.core.pace import needs
+from skipgs_plug.core.pace import loop_facts, needs
 from skipgs_plug.core.pace.densification_events import LEAST_EVENTS
 from skipgs_plug.core.pace.needs import for_new_gaussians, growing_factor
+from skipgs_plug.core.pace.phase import PhasePlan
 
 VIEWS = [f"{i}.png" for i in range(4)]
 INTERVAL, START, LAST = 20, 400, 600
@@ -304,6 +305,15 @@ def test_a_scene_that_grows_strongly_gets_more_iterations_in_both_phases():
         Multiplies(0.1).train(gate)
     assert gate.report()["refine_share"] == 0.2
     assert gate.report()["growing"]["iterations_run"] == pytest.approx(600, abs=3)
+
+
+def test_a_trainer_whose_positions_slow_down_too_late_gets_still_more_in_longer_phases(monkeypatch):
+    monkeypatch.setattr(loop_facts, "PhasePlan", lambda *facts: PhasePlan(*facts)._replace(slow_positions=True))
+    with SkipGate(start_iter=3000, share="auto") as gate:
+        Multiplies(0.1).train(gate)
+    most = 0.4 * (3000 / 1500) ** 0.35
+    assert gate.report()["refine_share"] == pytest.approx(most)
+    assert 0.41 * 3000 < gate.report()["growing"]["iterations_run"] <= (most + 0.01) * 3000
 
 
 def test_more_iterations_run_after_an_event_that_adds_more_also_where_the_share_is_large():

@@ -9,6 +9,7 @@ from skipgs_plug.core.pace.needs import (
     geometry_part,
     growing_factor,
     growing_share,
+    most_raised,
     opacity_factor,
     refining_share,
     share_factor,
@@ -19,6 +20,12 @@ def test_new_gaussians_ask_for_more_iterations():
     assert share_factor(0.0) == share_factor(0.015) == 1.0 and share_factor(0.045) == pytest.approx(3.0)
     assert for_new_gaussians(None) == for_new_gaussians(0.2) == for_new_gaussians(2.718) == 1.0
     assert for_new_gaussians(97 / 3) == pytest.approx(1.82, abs=0.01)
+
+
+def test_new_gaussians_ask_for_two_fifths_at_most_and_for_more_where_positions_slow_down_too_late():
+    assert most_raised(3500, 2.0, slow_positions=False) == most_raised(1500, 2.0, slow_positions=True) == 0.4
+    assert most_raised(3500, 1.25, slow_positions=True) == pytest.approx(0.5)
+    assert most_raised(3500, 2.0, slow_positions=True) == pytest.approx(0.4 * (3500 / 1500) ** 0.35)
 
 
 def test_shares_that_auto_chooses():
