@@ -19,6 +19,7 @@ from skipgs_plug.core.pace.needs import (
     opacity_factor,
     opacity_rate,
     share_after_event,
+    share_after_reset,
 )
 from skipgs_plug.core.pace.parts import ONLY_HIGHER_BANDS, UNCHANGED, GrowingParts
 from skipgs_plug.core.pace.phase import Phase, PhasePlan
@@ -144,11 +145,7 @@ class Growing(Phase):
             if not must:
                 needed = self._needed(plan, number)
                 must = events.behind >= needed and not self._full(plan)
-        if self._share_now is None:
-            assert self.share is not None
-            self.sampling.share = self.share
-        else:
-            self.sampling.set_share(self._share_now)
+        self._set_share(plan, number)
         if not self.sampling.runs(must, barred=event and not must):
             if event:
                 events.skipped()
@@ -159,6 +156,17 @@ class Growing(Phase):
             self._rates.visibility.restart()
         self._set_rates(plan, number)
         return True
+
+    def _set_share(self, plan: GrowingPlan, number: int) -> None:
+        """Set the share of the iterations from iteration `number` on."""
+        assert self.share is not None
+        share = self.share if self._share_now is None else self._share_now
+        if self._auto and plan.reset is not None and number > plan.reset:
+            share = max(share, share_after_reset(plan.first + plan.length - plan.reset))
+        if share == self.share and self._share_now is None:
+            self.sampling.share = share
+        else:
+            self.sampling.set_share(share)
 
     def _set_rates(self, plan: GrowingPlan, number: int) -> None:
         """Set the learning rates of an iteration that runs."""

@@ -62,6 +62,12 @@ NEW_GAUSSIANS = 1 / 3
 # iterations end 0.10 dB higher than 1,201 (seed 0), which end level with the trainer's own run (three seeds). Some
 # trainers may run more, see `most_raised`.
 MOST_RAISED_SHARE = 0.4
+# Least number of iterations from the last opacity reset to the last densification event, if no more than `LATE_RESET`
+# iterations of the schedule lie between them. Events would come among opacities of 0.01 otherwise, and refinement, too.
+# Inria's script with 7,000 iterations resets 500 before it ends to grow. On plant, 115 of them ended .0149 SSIM below
+# the own run with 77 % of its Gaussians, and all of them .0026 below it with 85 %.
+STEPS_AFTER_RESET = 500
+LATE_RESET = 1000
 # Number of iterations of growth from which steps need not be longer. With fewer iterations, the factor grows with the
 # square of the lack. Longer schedules reset opacities more often, and the few iterations between two resets do not
 # tolerate long steps: four times the rate in 1,500 iterations cost bonsai 0.6 dB, but gained 0.5 dB and more in 700 to
@@ -256,6 +262,15 @@ def growing_share(
         from_random = max(GROWING_STEPS_FROM_RANDOM, GROWING_SIGHTS_FROM_RANDOM / shown_of_random)
     needed = max(steps, min(STEPS_PER_EVENT * events, LEAST_GROWING_STEPS), from_random, visits * epoch)
     return min(1.0, max(LEAST_GROWING_SHARE, needed / iterations))
+
+
+def share_after_reset(iterations: int) -> float:
+    """Return the least share of the iterations that runs after the last opacity reset of the growing phase.
+
+    Args:
+        iterations: Iterations of the schedule from the reset to the end of densification.
+    """
+    return min(1.0, STEPS_AFTER_RESET / max(iterations, 1)) if iterations <= LATE_RESET else 0.0
 
 
 def share_factor(growth: float) -> float:

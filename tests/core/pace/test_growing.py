@@ -270,8 +270,8 @@ class Multiplies(Loop):
         self.growth, self.means = growth, torch.nn.Parameter(torch.rand(100, 3))
         self.optimizer = torch.optim.Adam([{"params": [self.means], "name": "xyz"}], lr=0.1)
 
-    def train(self, gate, until=6000):
-        for step in gate.iterations(range(6000), views=VIEWS, events=range(20, 3000, 20)):
+    def train(self, gate, until=6000, **options):
+        for step in gate.iterations(range(6000), views=VIEWS, events=range(20, 3000, 20), **options):
             self.ran.append(step)
             if step >= until:
                 break
@@ -324,6 +324,19 @@ def test_more_iterations_run_after_an_event_that_adds_more_also_where_the_share_
         run[growth] = gate.report()["growing"]["iterations_run"]
     assert run[0.01] == pytest.approx(765, abs=3)  # 600 * 2 ** 0.35
     assert run[0.03] > 1.2 * run[0.01]
+
+
+@pytest.mark.parametrize(
+    ("reset", "share", "least", "most"),
+    [(2500, "auto", 1, 1), (2000, "auto", 0.48, 0.55), (1000, "auto", 0.2, 0.3), (2500, 0.25, 0.2, 0.3)],
+)
+def test_opacities_recover_from_a_late_reset_while_the_scene_grows(reset, share, least, most):
+    with SkipGate(start_iter=3000, share=share) as gate:
+        loop = Multiplies(0.0).train(gate, resets=[reset])
+    ran = sum(reset < step < 3000 for step in loop.ran) / (2999 - reset)
+    assert least <= ran <= most
+    before = sum(20 < step < reset for step in loop.ran) / (reset - 21)
+    assert before == pytest.approx(765 / 3000 if share == "auto" else 0.25, abs=0.02)
 
 
 def test_steps_conserve_the_path_in_any_schedule_if_opacities_are_never_reset():

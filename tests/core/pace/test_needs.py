@@ -12,6 +12,7 @@ from skipgs_plug.core.pace.needs import (
     most_raised,
     opacity_factor,
     refining_share,
+    share_after_reset,
     share_factor,
 )
 
@@ -20,6 +21,11 @@ def test_new_gaussians_ask_for_more_iterations():
     assert share_factor(0.0) == share_factor(0.015) == 1.0 and share_factor(0.045) == pytest.approx(3.0)
     assert for_new_gaussians(None) == for_new_gaussians(0.2) == for_new_gaussians(2.718) == 1.0
     assert for_new_gaussians(97 / 3) == pytest.approx(1.82, abs=0.01)
+
+
+def test_a_late_reset_asks_for_500_iterations():
+    assert share_after_reset(500) == share_after_reset(0) == 1.0 and share_after_reset(1000) == 0.5
+    assert share_after_reset(3000) == 0.0  # there are enough of them in any case
 
 
 def test_new_gaussians_ask_for_two_fifths_at_most_and_for_more_where_positions_slow_down_too_late():
