@@ -159,14 +159,23 @@ class Growing(Phase):
 
     def _set_share(self, plan: GrowingPlan, number: int) -> None:
         """Set the share of the iterations from iteration `number` on."""
-        assert self.share is not None
-        share = self.share if self._share_now is None else self._share_now
-        if self._auto and plan.reset is not None and number > plan.reset:
-            share = max(share, share_after_reset(plan.first + plan.length - plan.reset))
+        share = self._share_at(plan, number)
         if share == self.share and self._share_now is None:
             self.sampling.share = share
         else:
             self.sampling.set_share(share)
+
+    @property
+    def _asked(self) -> float:
+        """Share of the present iterations that the scene asks for."""
+        assert self.share is not None
+        return self.share if self._share_now is None else self._share_now
+
+    def _share_at(self, plan: GrowingPlan, number: int) -> float:
+        """Return the share that runs around iteration `number`: after a late reset more, so that opacities recover."""
+        if not self._auto or plan.reset is None or number <= plan.reset:
+            return self._asked
+        return max(self._asked, share_after_reset(plan.first + plan.length - plan.reset))
 
     def _set_rates(self, plan: GrowingPlan, number: int) -> None:
         """Set the learning rates of an iteration that runs."""
@@ -218,7 +227,9 @@ class Growing(Phase):
         # The ray-traced scene, which grows to e times as many Gaussians at most, needs more iterations per event with a
         # larger share. Scenes that grow more do not.
         grows_strongly = self._auto and self._grows_strongly
-        return plan.events.needed(number, self._visible_now, self.share, plan.length, grows_strongly)
+        needed = plan.events.needed(number, self._visible_now, self.share, plan.length, grows_strongly)
+        # After a late reset, as many events run as without it: with more, scenes end with 109 instead of 105 %.
+        return round(needed * self._share_at(plan, number) / self._asked)
 
     @property
     def _grows_strongly(self) -> bool:
