@@ -65,7 +65,7 @@ MOST_RAISED_SHARE = 0.4
 # Least number of iterations from the last opacity reset to the last densification event, if no more than `LATE_RESET`
 # iterations of the schedule lie between them. Refinement would begin among opacities of 0.01 otherwise. Inria's script
 # with 7,000 iterations resets 500 before it ends to grow. With 115 of them, three scenes end 0.13 to 0.35 dB (.0016 to
-# .0068 SSIM) lower than with all of them and as many events.
+# .0067 SSIM) lower than with all of them and as many events.
 STEPS_AFTER_RESET = 500
 LATE_RESET = 1000
 # Number of iterations of growth from which steps need not be longer. With fewer iterations, the factor grows with the
