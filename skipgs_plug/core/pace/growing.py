@@ -173,9 +173,10 @@ class Growing(Phase):
 
     def _share_at(self, plan: GrowingPlan, number: int) -> float:
         """Return the share that runs around iteration `number`: after a late reset more, so that opacities recover."""
-        if not self._auto or plan.reset is None or number <= plan.reset:
+        end = plan.first + plan.length
+        if not self._auto or plan.reset is None or not plan.reset < number < end:
             return self._asked
-        return max(self._asked, share_after_reset(plan.first + plan.length - plan.reset))
+        return max(self._asked, share_after_reset(end - plan.reset))
 
     def _set_rates(self, plan: GrowingPlan, number: int) -> None:
         """Set the learning rates of an iteration that runs."""

@@ -270,7 +270,7 @@ def share_after_reset(iterations: int) -> float:
     Args:
         iterations: Iterations of the schedule from the reset to the end of densification.
     """
-    return min(1.0, STEPS_AFTER_RESET / max(iterations, 1)) if iterations <= LATE_RESET else 0.0
+    return min(1.0, STEPS_AFTER_RESET / iterations) if iterations <= LATE_RESET else 0.0
 
 
 def share_factor(growth: float) -> float:

@@ -24,7 +24,7 @@ def test_new_gaussians_ask_for_more_iterations():
 
 
 def test_a_late_reset_asks_for_500_iterations():
-    assert share_after_reset(500) == share_after_reset(0) == 1.0 and share_after_reset(1000) == 0.5
+    assert share_after_reset(500) == share_after_reset(1) == 1.0 and share_after_reset(1000) == 0.5
     assert share_after_reset(3000) == 0.0  # there are enough of them in any case
 
 
