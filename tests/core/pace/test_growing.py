@@ -270,8 +270,8 @@ class Multiplies(Loop):
         self.growth, self.means = growth, torch.nn.Parameter(torch.rand(100, 3))
         self.optimizer = torch.optim.Adam([{"params": [self.means], "name": "xyz"}], lr=0.1)
 
-    def train(self, gate, until=6000, **options):
-        for step in gate.iterations(range(6000), views=VIEWS, events=range(20, 3000, 20), **options):
+    def train(self, gate, until=6000, events=range(20, 3000, 20), **options):
+        for step in gate.iterations(range(6000), views=VIEWS, events=events, **options):
             self.ran.append(step)
             if step >= until:
                 break
@@ -337,6 +337,13 @@ def test_opacities_recover_from_a_late_reset_while_the_scene_grows(reset, share,
     assert least <= ran <= most
     before = sum(20 < step < reset for step in loop.ran) / (reset - 21)
     assert before == pytest.approx(765 / 3000 if share == "auto" else 0.25, abs=0.02)
+
+
+def test_what_follows_the_last_event_does_not_count_for_the_recovery():
+    with SkipGate(start_iter=3000, share="auto") as gate:
+        loop = Multiplies(0.0).train(gate, events=range(20, 2500, 20), resets=[2300])
+    assert {*range(2300, 2500)} <= set(loop.ran)
+    assert sum(2500 <= step < 3000 for step in loop.ran) < 0.4 * 500
 
 
 def test_steps_conserve_the_path_in_any_schedule_if_opacities_are_never_reset():
