@@ -160,8 +160,8 @@ class Growing(Phase):
     def _set_share(self, plan: GrowingPlan, number: int) -> None:
         """Set the share of the iterations from iteration `number` on."""
         share = self._share_at(plan, number)
-        if share == self.share and self._share_now is None:
-            self.sampling.share = share
+        if self._share_now is None and (plan.reset is None or number <= plan.reset):
+            self.sampling.share = share  # it never changed, so the iterations before it was settled count, too
         else:
             self.sampling.set_share(share)
 

@@ -13,6 +13,7 @@ from skipgs_plug.core.pace import loop_facts, needs
 from skipgs_plug.core.pace.densification_events import LEAST_EVENTS
 from skipgs_plug.core.pace.needs import for_new_gaussians, growing_factor
 from skipgs_plug.core.pace.phase import PhasePlan
+from skipgs_plug.core.pace.visibility import Visibility
 
 VIEWS = [f"{i}.png" for i in range(4)]
 INTERVAL, START, LAST = 20, 400, 600
@@ -344,6 +345,15 @@ def test_what_follows_the_last_event_does_not_count_for_the_recovery():
         loop = Multiplies(0.0).train(gate, events=range(20, 2500, 20), resets=[2300])
     assert {*range(2300, 2500)} <= set(loop.ran)
     assert sum(2500 <= step < 3000 for step in loop.ran) < 0.4 * 500
+
+
+def test_after_the_recovery_the_share_runs_as_before_it(monkeypatch):
+    monkeypatch.setattr(Visibility, "visible", None)  # as with features that a network decodes
+    with SkipGate(start_iter=3000, share="auto") as gate:
+        loop = Multiplies(0.0).train(gate, events=range(20, 2500, 20), resets=[2300])
+    for numbers in (range(100, 2300), range(2500, 2600), range(2600, 3000)):
+        ran = len(set(numbers) & set(loop.ran)) / len(numbers)
+        assert ran == pytest.approx(gate.report()["growing"]["share"], abs=0.03)
 
 
 def test_steps_conserve_the_path_in_any_schedule_if_opacities_are_never_reset():
