@@ -23,8 +23,9 @@ def freed_memory_kept() -> Iterator[None]:
     Tensors of 32 MiB and more are mapped for themselves otherwise, so that the system must fill their pages with zeros
     at each allocation. A script that joins the SH coefficients of 190,000 Gaussians in each iteration has such tensors.
     """
-    set_parameter = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    if set_parameter is None:
+    libc = ctypes.CDLL(None) if sys.platform == "linux" else None
+    set_parameter = getattr(libc, "mallopt", None)
+    if libc is None or set_parameter is None:
         yield
         return
     set_parameter(MMAP_MAX, NO_BLOCK)
@@ -35,4 +36,4 @@ def freed_memory_kept() -> Iterator[None]:
     finally:
         set_parameter(MMAP_MAX, BLOCKS)
         set_parameter(TRIM_THRESHOLD, BYTES)
-        ctypes.CDLL(None).malloc_trim(0)
+        libc.malloc_trim(0)
